@@ -1,0 +1,1 @@
+"""The method itself: NumPy in, NumPy out, no ROS import anywhere below this package."""

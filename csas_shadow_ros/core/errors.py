@@ -1,0 +1,69 @@
+"""Errors of the package: one root, so that a caller can catch everything that we raise."""
+
+from __future__ import annotations
+
+
+class CsasError(Exception):
+    """Root of every error that this package raises on purpose."""
+
+
+class ParameterError(CsasError, ValueError):
+    """A parameter is out of range; the message gives its name, value and bounds."""
+
+
+class GeometryError(CsasError, ValueError):
+    """A grid, camera or position is not usable as the geometry of an image."""
+
+
+class TrackError(GeometryError):
+    """A track is not usable: too short, out of order, not a circle round the scene."""
+
+
+class ViewError(CsasError, ValueError):
+    """One view cannot be used; the run goes on without it."""
+
+
+class NoTargetError(CsasError):
+    """A target was needed and neither given nor found."""
+
+
+class SpectrumSignError(CsasError):
+    """The image contradicts its stated spectrum sign: its shadows fall towards the sonar."""
+
+
+class AdapterError(CsasError, ValueError):
+    """A message breaks the contract; the error names the field, the value and what was expected."""
+
+
+class BagError(CsasError):
+    """A bag cannot be read or does not honour the contract."""
+
+
+def check_range(
+    name: str, value: float, low: float, high: float, unit: str = "", *, open_low: bool = False
+) -> float:
+    """Return `value` if it is finite and inside [low, high], else raise.
+
+    Parameters
+    ----------
+    name : str
+        What the value is, for the message.
+    value : float
+        The value.
+    low, high : float
+        Bounds, inclusive; with `open_low` the lower bound itself is refused.
+    unit : str
+        Unit, for the message.
+
+    Raises
+    ------
+    ParameterError
+        If the value is not a finite number inside the bounds.
+    """
+    number = float(value)
+    inside = (low < number if open_low else low <= number) and number <= high
+    if not inside:  # also true for NaN
+        bracket = "(" if open_low else "["
+        unit = f" {unit}" if unit else ""
+        raise ParameterError(f"{name} is {value}{unit}; expected {bracket}{low:g}, {high:g}]{unit}")
+    return number

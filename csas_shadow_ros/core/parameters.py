@@ -1,0 +1,196 @@
+"""Parameters of every stage: one bounded, described dataclass each.
+
+The same dataclasses drive the in-process pipeline, the ROS parameter descriptors, the YAML file and
+the README's table. Users meet degrees here (``_deg``); the code behind works in radians.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from .errors import ParameterError
+
+T = TypeVar("T")
+
+
+def bounded(
+    default: Any,
+    doc: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    unit: str = "",
+    length: int | None = None,
+) -> Any:
+    """Declare a dataclass field with its bounds, unit and one line of description.
+
+    A float, int, bool, str or tuple of floats (`length` long, each inside the bounds).
+    """
+    meta = {"doc": doc, "low": low, "high": high, "choices": choices, "unit": unit, "length": length}
+    return dataclasses.field(default=default, metadata=meta)
+
+
+def _check_number(name: str, value: Any, field: dataclasses.Field[Any]) -> float | int:
+    meta = field.metadata
+    unit = f" {meta['unit']}" if meta["unit"] else ""
+    kind = int if isinstance(field.default, int) else float
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ParameterError(f"{name} is {value!r}; expected a number{unit and ' in' + unit}")
+    if kind is int and float(value) != int(value):
+        raise ParameterError(f"{name} is {value!r}; expected a whole number")
+    low, high = meta["low"], meta["high"]
+    if not math.isfinite(value) or (low is not None and value < low) or (high is not None and value > high):
+        raise ParameterError(f"{name} is {value}{unit}; expected a number in [{low:g}, {high:g}]{unit}")
+    return kind(value)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Base of all parameter sets: checks every field against its bounds.
+
+    Raises
+    ------
+    ParameterError
+        Naming the parameter, its value and the bounds.
+    """
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value, name, meta = getattr(self, field.name), field.name, field.metadata
+            checked: Any
+            if isinstance(field.default, bool):
+                if not isinstance(value, bool):
+                    raise ParameterError(f"{name} is {value!r}; expected true or false")
+                checked = value
+            elif isinstance(field.default, str):
+                if not isinstance(value, str) or (meta["choices"] and value not in meta["choices"]):
+                    expected = ", ".join(meta["choices"]) or "a text"
+                    raise ParameterError(f"{name} is {value!r}; expected one of: {expected}")
+                checked = value
+            elif isinstance(field.default, tuple):
+                try:
+                    items = tuple(value)
+                except TypeError:
+                    raise ParameterError(f"{name} is {value!r}; expected {meta['length']} numbers") from None
+                if len(items) != meta["length"]:
+                    raise ParameterError(f"{name} is {list(items)}; expected {meta['length']} numbers")
+                checked = tuple(float(_check_number(name, item, field)) for item in items)
+            else:
+                checked = _check_number(name, value, field)
+            object.__setattr__(self, name, checked)
+
+    @classmethod
+    def from_mapping(cls: type[T], values: Mapping[str, Any]) -> T:
+        """Make a parameter set from a mapping; unknown names are refused.
+
+        Raises
+        ------
+        ParameterError
+            If a name is unknown or a value is out of range.
+        """
+        known = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+        unknown = sorted(set(values) - set(known))
+        if unknown:
+            raise ParameterError(f"unknown parameter {unknown[0]!r}; expected one of: {', '.join(known)}")
+        return cls(**values)
+
+
+@dataclass(frozen=True)
+class SubApertureParameters(Parameters):
+    """Sub-aperture generation (section 3.1)."""
+
+    aperture_deg: float = bounded(12.0, "full width of a sub-aperture", low=0.5, high=90.0, unit="deg")
+    step_deg: float = bounded(1.0, "aspect step between views; divides 360", low=0.1, high=90.0, unit="deg")
+    taper: str = bounded(
+        "none", "window over the aperture ('none' is the paper's)", choices=("none", "tukey", "taylor")
+    )
+    oversampling: float = bounded(
+        1.5, "view pixels per resolution cell of the wedge's bandwidth", low=1.0, high=8.0
+    )
+    spacing_m: float = bounded(0.0, "pixel of the views; 0: from the wedge's bandwidth", low=0.0, high=100.0, unit="m")
+    extent_m: float = bounded(
+        0.0, "side of the square views; 0: whole image at every aspect", low=0.0, high=1e5, unit="m"
+    )
+    min_coverage: float = bounded(
+        0.75, "least fraction of the aperture that the track must cover", low=0.0, high=1.0
+    )
+    check_sign: bool = bounded(True, "refuse an image whose shadows contradict its spectrum sign")
+
+
+@dataclass(frozen=True)
+class ShadowParameters(Parameters):
+    """Shadow enhancement, FFSE (section 3.2)."""
+
+    enhancement: str = bounded(
+        "exact", "filter: exact, the paper's simplified one, or none", choices=("exact", "small_angle", "none")
+    )
+
+
+@dataclass(frozen=True)
+class LikelihoodParameters(Parameters):
+    """Likelihood of a pixel being outside the shadow (section 4.2) and shadow segmentation."""
+
+    background: str = bounded(
+        "local", "seabed level: one a view, or a smooth surface", choices=("local", "global")
+    )
+    shadow_level: str = bounded(
+        "estimated", "shadow level: measured, or from the contrast", choices=("estimated", "contrast")
+    )
+    shadow_contrast_db: float = bounded(
+        12.0, "seabed over shadow level; start of the estimate", low=1.0, high=60.0, unit="dB"
+    )
+    smoothing_m: float = bounded(
+        0.0, "multi-look smoothing before the likelihood; 0: none, as in the paper", low=0.0, high=10.0, unit="m"
+    )
+    echo_unknown: bool = bounded(True, "target echo knows nothing (NaN) instead of outside")
+    echo_db: float = bounded(8.0, "echo: smoothed intensity above the seabed by", low=1.0, high=60.0, unit="dB")
+
+
+@dataclass(frozen=True)
+class CarvingParameters(Parameters):
+    """Space carving (section 4)."""
+
+    method: str = bounded("soft", "soft: mean likelihood; hard: segmented silhouettes", choices=("soft", "hard"))
+    voxel_size_m: float = bounded(0.02, "edge of a voxel", low=1e-4, high=1e3, unit="m")
+    threshold: float = bounded(0.0, "object where the mean l_out is below this; 0: automatic", low=0.0, high=1.0)
+    min_views_fraction: float = bounded(
+        0.25, "a voxel seen by a smaller fraction of the views is unknown", low=0.0, high=1.0
+    )
+
+
+@dataclass(frozen=True)
+class TargetParameters(Parameters):
+    """Where the target is and how large a volume is carved."""
+
+    target: str = bounded("auto", "auto: find it; given: at position_m", choices=("auto", "given"))
+    position_m: tuple[float, ...] = bounded(
+        (0.0, 0.0), "x, y of the target when given", low=-1e6, high=1e6, unit="m", length=2
+    )
+    size_m: tuple[float, ...] = bounded(
+        (0.0, 0.0, 0.0), "x, y, z size of the carved volume; 0: automatic", low=0.0, high=1e5, unit="m", length=3
+    )
+
+
+STAGES: dict[str, type[Parameters]] = {
+    "sub_aperture": SubApertureParameters,
+    "shadow": ShadowParameters,
+    "likelihood": LikelihoodParameters,
+    "carving": CarvingParameters,
+    "target": TargetParameters,
+}
+
+
+@dataclass(frozen=True)
+class PipelineParameters:
+    """Parameters of the whole chain, one set a stage."""
+
+    sub_aperture: SubApertureParameters = dataclasses.field(default_factory=SubApertureParameters)
+    shadow: ShadowParameters = dataclasses.field(default_factory=ShadowParameters)
+    likelihood: LikelihoodParameters = dataclasses.field(default_factory=LikelihoodParameters)
+    carving: CarvingParameters = dataclasses.field(default_factory=CarvingParameters)
+    target: TargetParameters = dataclasses.field(default_factory=TargetParameters)

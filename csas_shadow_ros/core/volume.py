@@ -1,0 +1,113 @@
+"""Voxel lattices: the volume that is carved, and the grid that carving leaves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import GeometryError, check_range
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A lattice of cubic voxels in the scene frame.
+
+    Parameters
+    ----------
+    origin_m : (float, float, float)
+        Scene (x, y, z) of the centre of voxel [0, 0, 0].
+    voxel_size_m : float
+        Edge of a voxel.
+    shape : (int, int, int)
+        Voxels along (z, y, x).
+    """
+
+    origin_m: tuple[float, float, float]
+    voxel_size_m: float
+    shape: tuple[int, int, int]
+
+    def __post_init__(self) -> None:
+        check_range("voxel size", self.voxel_size_m, 0, 1e4, "m", open_low=True)
+        if not np.all(np.isfinite(self.origin_m)):
+            raise GeometryError(f"volume origin is {self.origin_m}; expected finite metres")
+        for axis, n in zip("zyx", self.shape, strict=True):
+            check_range(f"voxels along {axis}", n, 1, 1 << 14)
+
+    @classmethod
+    def around(
+        cls, position_m: tuple[float, float], size_m: tuple[float, float, float], voxel_size_m: float
+    ) -> Volume:
+        """Make the volume that stands on the seabed round a ground position.
+
+        Parameters
+        ----------
+        position_m : (float, float)
+            Middle (x, y).
+        size_m : (float, float, float)
+            Extent along (x, y, z), rounded up to whole voxels.
+        voxel_size_m : float
+            Edge of a voxel; the lowest layer's centres are at half of it.
+        """
+        d = voxel_size_m
+        nx, ny, nz = (max(1, int(np.ceil(s / d - 1e-9))) for s in size_m)
+        x, y = (c - (n - 1) / 2.0 * d for c, n in zip(position_m, (nx, ny), strict=True))
+        return cls((x, y, d / 2.0), d, (nz, ny, nx))
+
+    @property
+    def x_m(self) -> NDArray[np.float64]:
+        """Centres along x, shape (nx,)."""
+        return self.origin_m[0] + np.arange(self.shape[2]) * self.voxel_size_m
+
+    @property
+    def y_m(self) -> NDArray[np.float64]:
+        """Centres along y, shape (ny,)."""
+        return self.origin_m[1] + np.arange(self.shape[1]) * self.voxel_size_m
+
+    @property
+    def z_m(self) -> NDArray[np.float64]:
+        """Centres along z, shape (nz,)."""
+        return self.origin_m[2] + np.arange(self.shape[0]) * self.voxel_size_m
+
+    @property
+    def centre_m(self) -> tuple[float, float, float]:
+        """Middle (x, y, z) of the volume."""
+        nz, ny, nx = self.shape
+        half = self.voxel_size_m / 2.0
+        x, y, z = self.origin_m
+        return x + (nx - 1) * half, y + (ny - 1) * half, z + (nz - 1) * half
+
+    @property
+    def size_m(self) -> tuple[float, float, float]:
+        """Extent along (x, y, z)."""
+        nz, ny, nx = self.shape
+        return nx * self.voxel_size_m, ny * self.voxel_size_m, nz * self.voxel_size_m
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelGrid:
+    """What carving leaves.
+
+    Parameters
+    ----------
+    volume : Volume
+        The lattice.
+    likelihood : ndarray of float32, shape (nz, ny, nx)
+        Mean l_out (soft) or fraction of views that removed the voxel (hard); NaN where unknown.
+    views : ndarray of uint16, shape (nz, ny, nx)
+        How many views know something of each voxel.
+    threshold : float
+        Object where likelihood < threshold. NaN if there is no object.
+    occupied : ndarray of bool, shape (nz, ny, nx)
+        The object's voxels.
+    method : str
+        How the voxels were carved.
+    """
+
+    volume: Volume
+    likelihood: NDArray[np.float32]
+    views: NDArray[np.uint16]
+    threshold: float
+    occupied: NDArray[np.bool_]
+    method: str = "soft"
