@@ -1,0 +1,109 @@
+"""Sectors: the full-circle image as it is made during a run, one coherent image an arc."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import GeometryError
+from .geometry import Acoustics, CoherentImage, GroundGrid
+
+
+@dataclass(frozen=True, eq=False)
+class Sector:
+    """A coherent baseband ground-plane image of one arc.
+
+    Parameters
+    ----------
+    pixels : ndarray of complex, shape (rows, cols)
+        The image, divided by exp(j carrier · (x, y)).
+    grid : GroundGrid
+        Its lattice.
+    acoustics : Acoustics
+        Its band.
+    stamp_ns : int
+        When the sonar was at `aspect_rad`; identifies the sector.
+    aspect_rad, aperture_rad : float
+        Centre and full width of the arc.
+    carrier_rad_m : (float, float)
+        Wavenumber (kx, ky), scene axes, that was divided out.
+    """
+
+    pixels: NDArray[Any]
+    grid: GroundGrid
+    acoustics: Acoustics
+    stamp_ns: int
+    aspect_rad: float
+    aperture_rad: float
+    carrier_rad_m: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.pixels.shape != self.grid.shape:
+            raise GeometryError(
+                f"sector has {self.pixels.shape} pixels; its grid says {self.grid.shape} (rows, cols)"
+            )
+
+    def on_carrier(self) -> NDArray[Any]:
+        """Return the true image, pixels · exp(j carrier · (x, y)), shape (rows, cols)."""
+        kx, ky = self.carrier_rad_m
+        if kx == 0.0 and ky == 0.0:
+            return self.pixels
+        dtype = self.pixels.dtype
+        along_x = np.exp(1j * kx * self.grid.x_of_columns()).astype(dtype)
+        along_y = np.exp(1j * ky * self.grid.y_of_rows()).astype(dtype)
+        product: NDArray[Any] = self.pixels * along_x[None, :] * along_y[:, None]
+        return product
+
+
+def same_grid(a: GroundGrid, b: GroundGrid) -> bool:
+    """Say whether two grids are the same lattice, to a millionth of a pixel."""
+    tolerance = 1e-6 * a.spacing_m
+    return a.shape == b.shape and all(
+        abs(x - y) <= tolerance
+        for x, y in ((a.spacing_m, b.spacing_m), (a.x_min_m, b.x_min_m), (a.y_max_m, b.y_max_m))
+    )
+
+
+def image_from_sectors(sectors: Iterable[Sector]) -> CoherentImage:
+    """Sum sectors, each put back on its carrier, to the full-circle image.
+
+    Parameters
+    ----------
+    sectors : iterable of Sector
+        Held one at a time. A stamp that comes twice counts once.
+
+    Returns
+    -------
+    CoherentImage
+        Stamped with the last sector's stamp.
+
+    Raises
+    ------
+    GeometryError
+        If there are none, or their grids or bands differ.
+    """
+    first: Sector | None = None
+    total: NDArray[Any] = np.empty((0, 0))
+    stamps: set[int] = set()
+    for sector in sectors:
+        if sector.stamp_ns in stamps:
+            continue
+        stamps.add(sector.stamp_ns)
+        if first is None:
+            first = sector
+            total = np.array(sector.on_carrier())
+            continue
+        if not same_grid(first.grid, sector.grid) or sector.acoustics != first.acoustics:
+            what = "band" if same_grid(first.grid, sector.grid) else "grid"
+            raise GeometryError(
+                f"sector at {sector.stamp_ns} ns has another {what} than the first at {first.stamp_ns} ns:"
+                f" {getattr(sector, 'grid' if what == 'grid' else 'acoustics')}; expected one for all"
+            )
+        total += sector.on_carrier()
+    if first is None:
+        raise GeometryError("there are no sectors to sum; expected at least one")
+    return CoherentImage(total, first.grid, first.acoustics, max(stamps))

@@ -1,0 +1,109 @@
+"""ROS messages to and from the core's types: a pair of functions a message, and no computing.
+
+Readers (`x_from_msg`) are duck-typed: they take an rclpy message and a rosbags one alike. Writers
+(`x_to_msg`) take a `MessageFactory`: `RclpyMessages()` or `RosbagsMessages()`. Nothing here imports
+ROS before the first rclpy message is made. Every message that breaks the contract raises one
+`AdapterError` with the field, its value and what was expected.
+"""
+
+from csas_shadow_ros.core.errors import AdapterError
+
+from .camera_info import (
+    GroundInfo,
+    SectorInfo,
+    check_pair,
+    ground_info_from_msg,
+    ground_info_to_msg,
+    sector_info_from_msg,
+    sector_info_to_msg,
+    view_info_from_msg,
+    view_info_to_msg,
+)
+from .image import check_pixels, image_from_msg, image_to_msg, pixels_from_msg, quantise
+from .mesh import mesh_from_msg, mesh_to_msg
+from .messages import (
+    SCENE_FRAME,
+    MessageFactory,
+    RclpyMessages,
+    RosbagsMessages,
+    stamp_from_ns,
+    stamp_to_ns,
+    type_name_of,
+)
+from .pairs import (
+    Pairer,
+    coherent_image_from_msgs,
+    coherent_image_to_msgs,
+    ground_picture_from_msgs,
+    ground_picture_to_msgs,
+    sector_from_msgs,
+    sector_to_msgs,
+    view_from_msgs,
+    view_to_msgs,
+    voxel_grid_from_msgs,
+    voxel_grid_to_msgs,
+)
+from .progress import Heartbeat, Level, ViewProgress, diagnostics_to_msg, progress_from_msg, progress_to_msg
+from .target import TargetBox, target_from_msg, target_to_msg
+from .topics import NAMESPACE, STREAMS, TOPICS, VIEW_STREAMS, ImageStream, Topic, absolute_name
+from .track import track_from_msg, track_to_msg
+from .voxels import Voxels, voxels_from_msg, voxels_to_msg
+
+__all__ = [
+    "NAMESPACE",
+    "SCENE_FRAME",
+    "STREAMS",
+    "TOPICS",
+    "VIEW_STREAMS",
+    "AdapterError",
+    "GroundInfo",
+    "Heartbeat",
+    "ImageStream",
+    "Level",
+    "MessageFactory",
+    "Pairer",
+    "RclpyMessages",
+    "RosbagsMessages",
+    "SectorInfo",
+    "TargetBox",
+    "Topic",
+    "ViewProgress",
+    "Voxels",
+    "absolute_name",
+    "check_pair",
+    "check_pixels",
+    "coherent_image_from_msgs",
+    "coherent_image_to_msgs",
+    "diagnostics_to_msg",
+    "ground_info_from_msg",
+    "ground_info_to_msg",
+    "ground_picture_from_msgs",
+    "ground_picture_to_msgs",
+    "image_from_msg",
+    "image_to_msg",
+    "mesh_from_msg",
+    "mesh_to_msg",
+    "pixels_from_msg",
+    "progress_from_msg",
+    "progress_to_msg",
+    "quantise",
+    "sector_from_msgs",
+    "sector_info_from_msg",
+    "sector_info_to_msg",
+    "sector_to_msgs",
+    "stamp_from_ns",
+    "stamp_to_ns",
+    "target_from_msg",
+    "target_to_msg",
+    "track_from_msg",
+    "track_to_msg",
+    "type_name_of",
+    "view_from_msgs",
+    "view_info_from_msg",
+    "view_info_to_msg",
+    "view_to_msgs",
+    "voxel_grid_from_msgs",
+    "voxel_grid_to_msgs",
+    "voxels_from_msg",
+    "voxels_to_msg",
+]
