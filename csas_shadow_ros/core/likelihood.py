@@ -1,0 +1,282 @@
+"""How likely each pixel lies outside the shadow (section 4.2 of the paper).
+
+Amplitudes are taken as Rayleigh distributed, with mode σ_r on the seabed and σ_s in shadow.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import ViewError
+from .geometry import View
+from .parameters import LikelihoodParameters
+
+FloatImage = NDArray[np.float32]
+
+#: Median of a Rayleigh distribution over its mode.
+_MEDIAN_OVER_MODE = math.sqrt(2.0 * math.log(2.0))
+#: A view needs this many known pixels for its seabed level to be estimated.
+_MIN_PIXELS = 256
+#: Shadow interiors of fewer pixels than this do not give a level.
+_MIN_SHADOW_PIXELS = 40
+#: A shadow less than 4 dB under the seabed is its own speckle.
+_MIN_CONTRAST2 = 10.0**0.4
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Seabed and shadow level of one view.
+
+    Parameters
+    ----------
+    seabed : ndarray of float32, shape (rows, cols)
+        σ_r at every pixel.
+    contrast : float
+        σ_r / σ_s.
+    shadow_fraction : float
+        Fraction of the known pixels inside shadows; NaN if it was not measured.
+    estimated : bool
+        Whether σ_s was measured (True) or comes from the contrast hypothesis.
+    """
+
+    seabed: FloatImage
+    contrast: float
+    shadow_fraction: float
+    estimated: bool
+
+    @property
+    def seabed_level(self) -> float:
+        """Median σ_r over the view."""
+        return float(np.median(self.seabed))
+
+
+def l_out(amplitude_over_seabed: NDArray[np.floating], contrast: float) -> NDArray[np.floating]:
+    """Evaluate l_out = (p_r / (p_r + p_s))² for amplitudes i/σ_r and contrast σ_r/σ_s.
+
+    Written as (1 + (σ_r/σ_s)² exp(-(i/σ_r)²/2 · ((σ_r/σ_s)² - 1)))⁻², which is finite at i = 0 and
+    cannot overflow.
+
+    Parameters
+    ----------
+    amplitude_over_seabed : ndarray
+        i/σ_r, not negative.
+    contrast : float
+        σ_r/σ_s, over 1.
+    """
+    c2 = np.float32(contrast * contrast)
+    power = np.square(amplitude_over_seabed)
+    ratio = c2 * np.exp(power * (np.float32(-0.5) * (c2 - np.float32(1.0))))
+    return np.square(np.reciprocal(np.float32(1.0) + ratio))
+
+
+def expected_l_out(contrast: float) -> tuple[float, float]:
+    """Return the mean of l_out over Rayleigh shadow pixels and over Rayleigh seabed pixels."""
+    # i² / (2σ²) is exponential: integrate over its quantiles.
+    quantiles = -np.log1p(-(np.arange(4096) + 0.5) / 4096)
+    seabed = l_out(np.sqrt(2.0 * quantiles).astype(np.float32), contrast)
+    shadow = l_out((np.sqrt(2.0 * quantiles) / contrast).astype(np.float32), contrast)
+    return float(shadow.mean()), float(seabed.mean())
+
+
+def _block_medians(
+    amplitude: FloatImage, block: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Median of each block with enough known pixels, and the blocks' middles in [-1, 1]."""
+    rows, cols = amplitude.shape
+    n_v, n_u = max(rows // block, 1), max(cols // block, 1)
+    tiles = amplitude[: n_v * block, : n_u * block]
+    tiles = tiles.reshape(n_v, min(block, rows), n_u, min(block, cols)).swapaxes(1, 2).reshape(n_v * n_u, -1)
+    enough = np.isfinite(tiles).sum(axis=1) >= tiles.shape[1] // 2
+    v, u = np.divmod(np.flatnonzero(enough), n_u)
+    medians = np.nanmedian(tiles[enough], axis=1) if enough.any() else np.empty(0)
+    return medians.astype(np.float64), ((v + 0.5) * block / rows) * 2 - 1, ((u + 0.5) * block / cols) * 2 - 1
+
+
+def _surface(v: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack([np.ones_like(v), v, u, v * v, v * u, u * u], axis=-1)
+
+
+def seabed_level(amplitude: FloatImage, background: str) -> FloatImage:
+    """Estimate σ_r, the seabed's Rayleigh mode, at every pixel of a view.
+
+    Shadows and echoes are outliers: the level is the median of block medians (`global`), or a
+    quadratic surface fitted to their logarithm with Tukey's biweight (`local`), which follows a
+    seabed whose level varies slowly.
+
+    Parameters
+    ----------
+    amplitude : ndarray of float32, shape (rows, cols)
+        Amplitude, NaN where unknown.
+    background : {'local', 'global'}
+        One level or a surface.
+
+    Raises
+    ------
+    ViewError
+        If too few pixels are known, or the seabed is zero.
+    """
+    rows, cols = amplitude.shape
+    known = int(np.isfinite(amplitude).sum())
+    if known < _MIN_PIXELS:
+        raise ViewError(f"view has {known} known pixels; expected at least {_MIN_PIXELS} to estimate its levels")
+    block = max(8, min(rows, cols) // 24)
+    medians, v, u = _block_medians(amplitude, block)
+    medians_ok = medians > 0
+    medians, v, u = medians[medians_ok], v[medians_ok], u[medians_ok]
+    if medians.size == 0:
+        raise ViewError("the seabed level of the view is zero; expected an amplitude image with a lit seabed")
+    log_level = np.log(medians)
+    middle = float(np.median(log_level))
+    if background == "global" or medians.size < 24:
+        return np.full((rows, cols), math.exp(middle) / _MEDIAN_OVER_MODE, np.float32)
+    design = _surface(v, u)
+    coefficients = np.zeros(6)
+    coefficients[0] = middle
+    for _ in range(8):
+        residual = log_level - design @ coefficients
+        scale = max(1.4826 * float(np.median(np.abs(residual))), 0.02)
+        weight = np.clip(1.0 - (residual / (4.0 * scale)) ** 2, 0.0, None) ** 2
+        # A little damping of slope and curvature: where outliers cover much of the view, stay flat.
+        normal = (design * weight[:, None]).T @ design + np.diag([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+        right = (design * weight[:, None]).T @ log_level
+        coefficients = np.linalg.solve(normal, right)
+    yy = (np.arange(rows) + 0.5) / rows * 2 - 1
+    xx = (np.arange(cols) + 0.5) / cols * 2 - 1
+    c = coefficients
+    # exp(a + b v + c u + d v² + e v u + f u²), separable but for the cross term
+    surface = (c[0] + c[1] * yy + c[3] * yy**2)[:, None] + (c[2] * xx + c[5] * xx**2)[None, :]
+    surface += c[4] * yy[:, None] * xx[None, :]
+    return (np.exp(surface) / _MEDIAN_OVER_MODE).astype(np.float32)
+
+
+def box_mean(image: FloatImage, known: NDArray[np.bool_], radius_px: tuple[int, int]) -> FloatImage:
+    """Mean over a box of known pixels only."""
+    size = (2 * radius_px[1] + 1, 2 * radius_px[0] + 1)
+    total = cv2.boxFilter(np.where(known, image, np.float32(0)), -1, size, normalize=False)
+    weight = cv2.boxFilter(known.astype(np.float32), -1, size, normalize=False)
+    return np.asarray(total / np.maximum(weight, 1.0), dtype=np.float32)
+
+
+def fit_contrast(amplitude_over_seabed: FloatImage, start_db: float) -> tuple[float, float] | None:
+    """Measure σ_r/σ_s on the view's own shadows.
+
+    Shadows are found first, as patches of low mean power, and the level is that of their interiors:
+    single pixels of seabed speckle, or a receiver that clips at zero, then do not count as shadow.
+
+    Parameters
+    ----------
+    amplitude_over_seabed : ndarray of float32
+        i/σ_r; NaN where unknown.
+    start_db : float
+        Contrast to start from.
+
+    Returns
+    -------
+    (contrast, shadow_fraction) or None
+        None where the view holds no shadow to measure: the fit is then refused rather than trusted.
+    """
+    known = np.isfinite(amplitude_over_seabed)
+    power = np.square(np.nan_to_num(amplitude_over_seabed)) / np.float32(2.0)
+    smooth = box_mean(power, known, (2, 2))
+    contrast2 = 10.0 ** (start_db / 10.0)
+    count = 0
+    for _ in range(3):
+        # Halfway between the two levels in dB; patches of 5×5 looks seldom cross it by chance.
+        dark = ((smooth < contrast2**-0.5) & known).astype(np.uint8)
+        interior = cv2.erode(dark, np.ones((5, 5), np.uint8)).astype(bool)
+        count = int(interior.sum())
+        if count < _MIN_SHADOW_PIXELS:
+            return None
+        contrast2 = 1.0 / max(float(power[interior].mean()), 1e-6)
+        if contrast2 < _MIN_CONTRAST2:
+            return None
+    return math.sqrt(contrast2), count / int(known.sum())
+
+
+def view_levels(view: View, parameters: LikelihoodParameters | None = None) -> Levels:
+    """Estimate a view's σ_r and σ_s.
+
+    Parameters
+    ----------
+    view : View
+        Amplitude after enhancement.
+    parameters : LikelihoodParameters
+        Local or global seabed level; measured or assumed contrast.
+
+    Raises
+    ------
+    ViewError
+        If the view is not a real amplitude image, or holds too little to estimate levels.
+    """
+    p = parameters or LikelihoodParameters()
+    amplitude = view.pixels
+    if amplitude.dtype != np.float32:
+        raise ViewError(f"shadow view has {amplitude.dtype} pixels; expected float32 amplitude")
+    seabed = seabed_level(amplitude, p.background)
+    assumed = 10.0 ** (p.shadow_contrast_db / 20.0)
+    if p.shadow_level == "contrast":
+        return Levels(seabed, assumed, math.nan, False)
+    fit = fit_contrast(amplitude / seabed, p.shadow_contrast_db)
+    return Levels(seabed, assumed, math.nan, False) if fit is None else Levels(seabed, *fit, True)
+
+
+def echo_mask(amplitude_over_seabed: FloatImage, echo_db: float) -> NDArray[np.bool_]:
+    """Mark echoes: pixels whose 3×3 mean power is `echo_db` above the seabed's.
+
+    Parameters
+    ----------
+    amplitude_over_seabed : ndarray of float32, shape (rows, cols)
+        i/σ_r; NaN where unknown.
+    echo_db : float
+        Threshold over the seabed's mean power 2σ_r², dB.
+    """
+    known = np.isfinite(amplitude_over_seabed)
+    power = box_mean(np.square(np.nan_to_num(amplitude_over_seabed)), known, (1, 1)) / 2.0
+    bright = (power > 10.0 ** (echo_db / 10.0)) & known
+    # One pixel more: the flank of an echo's response is neither seabed nor shadow.
+    return cv2.dilate(bright.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+
+
+def outside_likelihood(
+    view: View, parameters: LikelihoodParameters | None = None, levels: Levels | None = None
+) -> View:
+    """Turn a shadow view into l_out per pixel (section 4.2).
+
+    Parameters
+    ----------
+    view : View
+        float32 amplitude after enhancement, NaN where unknown.
+    parameters : LikelihoodParameters
+        Levels and treatment of echoes.
+    levels : Levels, optional
+        Levels that were estimated before.
+
+    Returns
+    -------
+    View
+        float32 l_out in [0, 1]; NaN where the view knows nothing (off the image, and in the target's
+        echo unless told otherwise).
+
+    Raises
+    ------
+    ViewError
+        If the levels cannot be estimated.
+    """
+    p = parameters or LikelihoodParameters()
+    levels = levels or view_levels(view, p)
+    relative = view.pixels / levels.seabed
+    echo = echo_mask(relative, p.echo_db) if p.echo_unknown else None
+    if p.smoothing_m > 0:
+        known = np.isfinite(relative)
+        radius = tuple(round(p.smoothing_m / (2.0 * s)) for s in view.info.camera.spacing_m)
+        power = box_mean(np.square(np.nan_to_num(relative)), known, (radius[0], radius[1]))
+        relative = np.where(known, np.sqrt(power), np.float32(np.nan))
+    out = l_out(relative, levels.contrast).astype(np.float32, copy=False)
+    if echo is not None:
+        out[echo] = np.nan
+    return replace(view, pixels=out)

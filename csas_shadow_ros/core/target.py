@@ -1,0 +1,298 @@
+"""Where is the target, how large a volume must be carved, and does the spectrum's sign fit it?
+
+All three are asked of the shadows: a coarse soft carving of the whole scene with narrow sub-apertures,
+which need no focus. Whatever casts a shadow of its own from all sides stands out as a body; a patch
+of seabed, however bright or dark, does not. "No object" is a valid answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from .carving import Carver
+from .errors import NoTargetError, SpectrumSignError, ViewError
+from .geometry import CoherentImage, Track, View
+from .likelihood import outside_likelihood
+from .parameters import (
+    CarvingParameters,
+    LikelihoodParameters,
+    ShadowParameters,
+    SubApertureParameters,
+    TargetParameters,
+)
+from .shadow import enhance
+from .subaperture import Spectrum, SubApertures
+from .volume import Volume
+
+#: Aperture (deg) of the views that search: narrow enough that shadows stay sharp without enhancement.
+_SEARCH_APERTURE_DEG = 6.0
+_SEARCH_STEP_DEG = 10.0
+#: Search voxels per side of the scene.
+_SEARCH_VOXELS = 110
+#: A search voxel is dark where the mean l_out of its (smoothed) views is under this.
+_DARK = 0.4
+#: The smallest body that the search reports, in search voxels.
+_MIN_VOXELS = 12
+#: Margin round the body in the carved volume: a share of its size, and at least this many search voxels.
+_MARGIN_SHARE, _MARGIN_VOXELS = 0.25, 5
+#: The other sign must explain this many times more body than the stated one to be called the right one.
+_SIGN_RATIO = 4.0
+
+
+@dataclass(frozen=True)
+class Target:
+    """A body that the search found.
+
+    Parameters
+    ----------
+    position_m : (float, float)
+        Middle (x, y) of the volume to carve.
+    size_m : (float, float, float)
+        Size (x, y, z) of the volume to carve, margin included.
+    evidence : float
+        Sum of height over the body's voxels, m⁴: large for a large, high body.
+    """
+
+    position_m: tuple[float, float]
+    size_m: tuple[float, float, float]
+    evidence: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What the search found, and the coarse grid that it looked at."""
+
+    targets: tuple[Target, ...]
+    volume: Volume
+    likelihood: NDArray[np.float32]
+
+    @property
+    def best(self) -> Target | None:
+        """The most evident body, or None."""
+        return self.targets[0] if self.targets else None
+
+
+def search_views(views: Sequence[View]) -> Search:
+    """Look for bodies in a few views from all round.
+
+    Parameters
+    ----------
+    views : sequence of View
+        float32 amplitude views.
+
+    Returns
+    -------
+    Search
+        Bodies in order of evidence; none is a valid answer.
+
+    Raises
+    ------
+    NoTargetError
+        If there is no usable view.
+    """
+    if not views:
+        raise NoTargetError("there is no view to find a target in; expected views from several aspects")
+    camera = views[0].info.camera
+    extent = _known_extent(views)
+    middle = camera.pixel_to_ground[:2] @ np.array([(camera.cols - 1) / 2.0, (camera.rows - 1) / 2.0, 1.0])
+    voxel = extent / _SEARCH_VOXELS
+    # Higher bodies throw their shadows off the image, whose voxels stay unknown then.
+    height = min(0.75 * extent * math.tan(camera.grazing_rad), 0.5 * float(camera.sonar_m[2]))
+    volume = Volume.around((float(middle[0]), float(middle[1])), (extent, extent, height), voxel)
+    smoothing = LikelihoodParameters(smoothing_m=max(voxel, 3.0 * max(camera.spacing_m)))
+    carver = Carver(volume, CarvingParameters(min_views_fraction=0.3))
+    for view in views:
+        try:
+            carver.integrate(outside_likelihood(view, smoothing))
+        except ViewError:
+            continue  # a view without levels has nothing to say here; it is reported where it counts
+    likelihood = carver.likelihood()
+    return Search(tuple(_bodies(likelihood, volume)), volume, likelihood)
+
+
+def _known_extent(views: Sequence[View]) -> float:
+    """Side (m) of the square whose area is what a view knows."""
+    areas = [
+        float(np.isfinite(v.pixels).sum()) * v.info.camera.spacing_m[0] * v.info.camera.spacing_m[1]
+        for v in views
+    ]
+    return math.sqrt(float(np.median(areas)))
+
+
+def _bodies(likelihood: NDArray[np.float32], volume: Volume) -> list[Target]:
+    with np.errstate(invalid="ignore"):
+        dark = likelihood < _DARK
+    labels, count = scipy.ndimage.label(dark, np.ones((3, 3, 3), bool))
+    d = volume.voxel_size_m
+    found = []
+    for label, box in enumerate(scipy.ndimage.find_objects(labels, count), start=1):
+        body = labels[box] == label
+        layers = np.flatnonzero(body.any(axis=(1, 2)))
+        if int(body.sum()) < _MIN_VOXELS or len(layers) < 2:
+            continue
+        z = volume.z_m[box[0]]
+        evidence = float((body.sum(axis=(1, 2)) * z).sum()) * d**3
+        low = np.array([volume.x_m[box[2].start], volume.y_m[box[1].start]]) - d / 2
+        high = np.array([volume.x_m[box[2].stop - 1], volume.y_m[box[1].stop - 1]]) + d / 2
+        size = high - low
+        margin = np.maximum(_MARGIN_SHARE * size, _MARGIN_VOXELS * d)
+        top = float(z[-1]) + d / 2
+        full = size + 2 * margin
+        middle = (low + high) / 2
+        found.append(
+            Target(
+                (float(middle[0]), float(middle[1])),
+                (float(full[0]), float(full[1]), float(top + max(_MARGIN_SHARE * top, 2 * d))),
+                evidence,
+            )
+        )
+    return sorted(found, key=lambda target: -target.evidence)
+
+
+def _search_image(image: CoherentImage, track: Track, spectrum: Spectrum) -> Search | None:
+    parameters = SubApertureParameters(aperture_deg=_SEARCH_APERTURE_DEG, step_deg=_SEARCH_STEP_DEG)
+    sub_apertures = SubApertures(image, track, parameters, spectrum=spectrum)
+    unfocused = ShadowParameters(enhancement="none")
+    views = []
+    for index in range(len(sub_apertures)):
+        try:
+            views.append(enhance(sub_apertures.view(index), (0.0, 0.0), unfocused))
+        except ViewError:
+            continue  # a gap in the track
+    return search_views(views) if views else None
+
+
+def find_target(
+    image: CoherentImage,
+    track: Track,
+    parameters: TargetParameters | None = None,
+    *,
+    spectrum: Spectrum | None = None,
+) -> Target | None:
+    """Find the most evident body in a coherent image, or take the position that is given.
+
+    Parameters
+    ----------
+    image, track : CoherentImage, Track
+        The run.
+    parameters : TargetParameters
+        A given position, or `auto`; a given size of the volume, or automatic.
+    spectrum : Spectrum, optional
+        The image's spectrum, if it was made before.
+
+    Returns
+    -------
+    Target or None
+        None: there is no object.
+    """
+    p = parameters or TargetParameters()
+    size = p.size_m
+    if p.target == "given" and all(s > 0 for s in size):
+        return Target((p.position_m[0], p.position_m[1]), (size[0], size[1], size[2]))
+    search = _search_image(image, track, spectrum or Spectrum.of_image(image))
+    return choose_target(search, p)
+
+
+def choose_target(search: Search | None, parameters: TargetParameters) -> Target | None:
+    """Choose among what the search found: the most evident body, or the one at the given position.
+
+    Raises
+    ------
+    NoTargetError
+        If a position is given, its volume's size is automatic, and no body is there.
+    """
+    p = parameters
+    found = list(search.targets) if search else []
+    if p.target == "given":
+        here = [t for t in found if _covers(t, p.position_m)]
+        if not here:
+            raise NoTargetError(
+                f"no object at the given position ({p.position_m[0]:g}, {p.position_m[1]:g}) m; expected one, or"
+                " size_m given too"
+            )
+        target = replace(here[0], position_m=(p.position_m[0], p.position_m[1]))
+    elif found:
+        target = found[0]
+    else:
+        return None
+    size = tuple(given or auto for given, auto in zip(p.size_m, target.size_m, strict=True))
+    return replace(target, size_m=(size[0], size[1], size[2]))
+
+
+def _covers(target: Target, position_m: tuple[float, ...]) -> bool:
+    return all(abs(p - t) <= s / 2 for p, t, s in zip(position_m, target.position_m, target.size_m, strict=False))
+
+
+@dataclass(frozen=True)
+class SignEvidence:
+    """How well the shadows fit the stated spectrum sign, and the other one.
+
+    Parameters
+    ----------
+    stated : int
+        The image's `spectrum_sign`.
+    stated_evidence, other_evidence : float
+        Evidence of the best body under the stated and the other sign; 0 where there is none.
+    """
+
+    stated: int
+    stated_evidence: float
+    other_evidence: float
+
+    @property
+    def verdict(self) -> str:
+        """'right', 'wrong', or 'unknown' where there are no shadows to tell it by."""
+        if self.stated_evidence > _SIGN_RATIO * self.other_evidence:
+            return "right"
+        if self.other_evidence > _SIGN_RATIO * self.stated_evidence:
+            return "wrong"
+        return "unknown"
+
+    def __str__(self) -> str:
+        text = {
+            "right": "shadows fall away from the sonar, as they must",
+            "wrong": f"shadows fall towards the sonar and enhancement would blur them: expected {-self.stated:+d}",
+            "unknown": "no shadows to tell by",
+        }[self.verdict]
+        return f"spectrum_sign is {self.stated:+d}: {text}"
+
+    def check(self) -> None:
+        """Raise if the sign is wrong.
+
+        Raises
+        ------
+        SpectrumSignError
+            Naming the stated sign and the expected one.
+        """
+        if self.verdict == "wrong":
+            raise SpectrumSignError(str(self))
+
+
+def spectrum_sign_evidence(
+    image: CoherentImage, track: Track, *, spectrum: Spectrum | None = None
+) -> tuple[SignEvidence, Search | None]:
+    """Compare the bodies found under the stated spectrum sign with those under the other.
+
+    A wrong sign turns every view by 180°: what the views then show falls towards the sonar, and no
+    body is consistent with it.
+
+    Returns
+    -------
+    SignEvidence
+        The comparison.
+    Search or None
+        The search under the stated sign, so that it need not be repeated.
+    """
+    spectrum = spectrum or Spectrum.of_image(image)
+    stated = _search_image(image, track, spectrum)
+    acoustics = replace(image.acoustics, spectrum_sign=-image.acoustics.spectrum_sign)
+    other = _search_image(replace(image, acoustics=acoustics), track, spectrum)
+    scores = [s.best.evidence if s is not None and s.best is not None else 0.0 for s in (stated, other)]
+    return SignEvidence(image.acoustics.spectrum_sign, scores[0], scores[1]), stated
+
