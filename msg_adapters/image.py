@@ -217,7 +217,12 @@ def _integer_pairs(pixels: NDArray[Any], scalar: str, encoding: str, where: str)
     return pairs
 
 
-def quantise(pixels: NDArray[Any], encoding: str) -> NDArray[np.complex64]:
+def largest_part(pixels: NDArray[Any]) -> float:
+    """Return the largest magnitude of a real or imaginary part."""
+    return max(float(np.abs(pixels.real).max()), float(np.abs(pixels.imag).max()))
+
+
+def quantise(pixels: NDArray[Any], encoding: str, peak: float = 0.0) -> NDArray[np.complex64]:
     """Scale a complex image so that its largest part fills an integer encoding, and round.
 
     Parameters
@@ -226,6 +231,8 @@ def quantise(pixels: NDArray[Any], encoding: str) -> NDArray[np.complex64]:
         The image.
     encoding : str
         ``8SC2`` or ``16SC2``.
+    peak : float
+        The part that shall fill it, if images share one scale; at least the image's own.
 
     Raises
     ------
@@ -235,9 +242,7 @@ def quantise(pixels: NDArray[Any], encoding: str) -> NDArray[np.complex64]:
     if encoding not in ("8SC2", "16SC2"):
         raise AdapterError(f"encoding is {encoding!r}; expected 8SC2 or 16SC2")
     check_pixels(pixels, stream("image"))
-    scale = np.iinfo(_FIXED[encoding][0]).max / max(
-        float(np.abs(pixels.real).max()), float(np.abs(pixels.imag).max())
-    )
+    scale = np.iinfo(_FIXED[encoding][0]).max / max(peak, largest_part(pixels))
     out = np.empty(pixels.shape, np.complex64)
     out.real = np.rint(pixels.real * scale)
     out.imag = np.rint(pixels.imag * scale)

@@ -126,7 +126,7 @@ STREAMS: dict[str, ImageStream] = {
         ),
         ImageStream(
             "sector",
-            COMPLEX_ENCODINGS,
+            ("32FC2", "16SC2", "8SC2"),
             CSAS_SECTOR,
             "coherent",
             "coherent baseband ground-plane image of one arc; all arcs on their carriers sum to the image",

@@ -1,0 +1,19 @@
+"""Bags: reading and writing runs as rosbag2 directories, and checking them. No ROS needed."""
+
+from .bag import BagMessage, BagReader, BagWriter, TopicInfo, copy, qos_profile
+from .run import MessagePair, Problem, Run, iterate_pairs, read_run, write_run
+
+__all__ = [
+    "BagMessage",
+    "BagReader",
+    "BagWriter",
+    "MessagePair",
+    "Problem",
+    "Run",
+    "TopicInfo",
+    "copy",
+    "iterate_pairs",
+    "qos_profile",
+    "read_run",
+    "write_run",
+]

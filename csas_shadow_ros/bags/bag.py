@@ -1,0 +1,560 @@
+"""rosbag2 directories and lone MCAP files: reading and writing messages, raw or decoded."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import yaml
+from mcap.exceptions import McapError
+from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import Reader as RosbagsReader
+from rosbags.rosbag2 import ReaderError
+from rosbags.serde import SerdeError
+
+from csas_shadow_ros.core.errors import AdapterError, BagError
+from msg_adapters.messages import stamp_to_ns, type_name_of, typestore
+from msg_adapters.topics import NAMESPACE, TOPICS, absolute_name, clean_namespace
+
+from .mcap_file import McapFile, TopicType
+
+METADATA = "metadata.yaml"
+_OWN_CHUNK_BYTES = 1 << 18
+_FOREVER = {"sec": 9223372036, "nsec": 854775807}
+
+
+class BagMessage(NamedTuple):
+    """One message of a bag.
+
+    Parameters
+    ----------
+    topic, type_name : str
+        Absolute name and ``package/msg/Name``.
+    log_time_ns : int
+        When it was recorded.
+    number : int
+        Its place among the messages of its topic, from 0, in reading order.
+    cdr : memoryview
+        The serialised message, as a publisher takes it.
+    """
+
+    topic: str
+    type_name: str
+    log_time_ns: int
+    number: int
+    cdr: memoryview
+
+    def decode(self) -> Any:
+        """Deserialise to a rosbags message; arrays are views of `cdr`.
+
+        Raises
+        ------
+        BagError
+            If the type is unknown or the bytes are no message of it.
+        """
+        try:
+            return typestore().deserialize_cdr(self.cdr, self.type_name)
+        except KeyError:
+            raise BagError(f"{self.topic}: type {self.type_name!r} is unknown; cannot decode it") from None
+        except (SerdeError, AssertionError, IndexError, OverflowError, MemoryError) as error:
+            raise BagError(
+                f"{self.topic} message {self.number} is no {self.type_name}: {error or 'too short'}"
+            ) from error
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """What a bag says of a topic: its type, and how many messages it holds."""
+
+    name: str
+    type_name: str
+    count: int
+
+
+class BagReader:
+    """Reads a rosbag2 directory or a lone storage file.
+
+    A bag that was cut off or damaged is read as far as it goes; every damage is one line in
+    `problems`. Use as a context manager or not; files are open only while messages are iterated.
+
+    Parameters
+    ----------
+    path : path-like
+        A directory with ``metadata.yaml`` (or what is left of one), an ``.mcap`` or a ``.db3`` file.
+    namespace : str, optional
+        Namespace of the contract's topics; found by itself if not given.
+
+    Raises
+    ------
+    BagError
+        If there is nothing to read.
+    """
+
+    def __init__(self, path: str | Path, namespace: str | None = None) -> None:
+        self.path = Path(path)
+        #: One line for each damage met so far.
+        self.problems: list[str] = []
+        self._files: list[McapFile] = []
+        self._foreign: Path | None = None
+        #: False if the recording was cut off or a file of it is missing.
+        self.complete = True
+        if not self.path.exists():
+            raise BagError(f"there is no bag at {self.path}")
+        self.topics: dict[str, TopicInfo] = {}
+        if self.path.is_dir():
+            self._open_directory()
+        elif self.path.suffix == ".db3":
+            self._open_foreign()
+        else:
+            self._open_files([self.path])
+        self.namespace = clean_namespace(namespace) if namespace is not None else self._find_namespace()
+
+    def __enter__(self) -> BagReader:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        return None
+
+    @property
+    def message_count(self) -> int:
+        """Number of messages in the bag."""
+        return sum(t.count for t in self.topics.values())
+
+    @property
+    def compressions(self) -> set[str]:
+        """Chunk compressions in use: '', zstd, lz4."""
+        return set().union(*(f.compressions for f in self._files))
+
+    @property
+    def has_checksums(self) -> bool:
+        """Whether changed bits would have been noticed."""
+        return self._foreign is None and all(f.has_checksums for f in self._files)
+
+    def _complain(self, problem: str) -> None:
+        if problem not in self.problems:
+            self.problems.append(problem)
+
+    def _open_directory(self) -> None:
+        storages = sorted(self.path.glob("*.mcap"))
+        meta_path = self.path / METADATA
+        if not meta_path.exists():
+            if not storages:
+                raise BagError(
+                    f"{self.path} holds no {METADATA} and no .mcap file; expected a rosbag2 directory"
+                )
+            self.complete = False
+            self._complain(f"{METADATA} is missing (the recording was cut off); reading the .mcap files")
+            self._open_files(storages)
+            return
+        try:
+            info = yaml.safe_load(meta_path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+            listed = [self.path / Path(name).name for name in info["relative_file_paths"]]
+            storage, mode = info["storage_identifier"], (info.get("compression_mode") or "").lower()
+        except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+            if not storages:
+                raise BagError(
+                    f"{meta_path} cannot be read ({error!r}) and there is no .mcap file"
+                ) from error
+            self.complete = False
+            self._complain(f"{METADATA} cannot be read ({error!r}); reading the .mcap files")
+            self._open_files(storages)
+            return
+        if storage != "mcap" or mode not in ("", "none"):
+            self._open_foreign()
+            return
+        present = [p for p in listed if p.exists()]
+        for lost in (p for p in listed if not p.exists()):
+            self.complete = False
+            self._complain(f"{lost.name}, listed in {METADATA}, is missing")
+        if not present and not storages:
+            names = ", ".join(p.name for p in listed)
+            raise BagError(f"{self.path}: no storage file is there; expected {names}")
+        self._open_files(present or storages)
+
+    def _open_files(self, paths: list[Path]) -> None:
+        self._files = [McapFile(p, self._complain) for p in paths]
+        self.complete &= all(f.complete for f in self._files)
+        for file in self._files:
+            for i, channel in file.channels.items():
+                self._add(channel.topic, channel.type_name, (file.counts or {}).get(i, 0))
+
+    def _open_foreign(self) -> None:
+        """Open what rosbags reads and McapFile does not: sqlite3, and compression by file or message."""
+        self._foreign = self.path
+        try:
+            with RosbagsReader(self.path) as reader:
+                for c in reader.connections:
+                    self._add(c.topic, c.msgtype, c.msgcount)
+        except (ReaderError, OSError, KeyError, ValueError) as error:
+            raise BagError(f"cannot read {self.path}: {error}") from error
+
+    def _add(self, topic: str, type_name: str, count: int) -> None:
+        if (known := self.topics.get(topic)) is not None:
+            count += known.count
+            if known.type_name != type_name:
+                self._complain(f"{topic} is recorded as {known.type_name} and as {type_name}")
+                type_name = known.type_name
+        self.topics[topic] = TopicInfo(topic, type_name, count)
+
+    def _find_namespace(self) -> str:
+        scores: dict[str, int] = {}
+        for name in self.topics:
+            for relative in TOPICS:
+                if not relative.startswith("/") and name.endswith(f"/{relative}"):
+                    prefix = name[: -len(relative) - 1]
+                    scores[prefix] = scores.get(prefix, 0) + 1
+        if not scores or NAMESPACE in scores:
+            return NAMESPACE
+        best = max(scores.values())
+        # Of /a and /a/likelihood with equally many topics, the outer one is the namespace.
+        leaders = sorted((p for p, n in scores.items() if n == best), key=len)
+        shortest = leaders[0]
+        if others := [p for p in leaders[1:] if not p.startswith(f"{shortest}/")]:
+            raise BagError(
+                f"{self.path} holds topics of {shortest or '/'} and of {others[0]}; expected one run:"
+                " name its namespace"
+            )
+        return shortest
+
+    def topic(self, relative: str) -> TopicInfo | None:
+        """Return a topic of the contract by its relative name, None if the bag lacks it."""
+        return self.topics.get(absolute_name(relative, self.namespace))
+
+    def messages(self, topics: Iterable[str] | None = None) -> Iterator[BagMessage]:
+        """Iterate messages, in the order of recording within each storage file.
+
+        Parameters
+        ----------
+        topics : iterable of str, optional
+            Names, absolute or relative to the namespace; all topics by default.
+
+        Raises
+        ------
+        BagError
+            If the storage cannot be read at all. Damaged parts are left out and named in `problems`.
+        """
+        wanted = None if topics is None else {absolute_name(t, self.namespace) for t in topics}
+        numbers: dict[str, int] = {}
+        for topic, type_name, when, cdr in self._raw(wanted):
+            number = numbers.get(topic, 0)
+            numbers[topic] = number + 1
+            yield BagMessage(topic, type_name, when, number, cdr)
+
+    def _raw(self, wanted: set[str] | None) -> Iterator[tuple[str, str, int, memoryview]]:
+        if self._foreign is not None:
+            try:
+                with RosbagsReader(self._foreign) as reader:
+                    chosen = [c for c in reader.connections if wanted is None or c.topic in wanted]
+                    for c, when, data in reader.messages(chosen) if chosen else ():
+                        yield c.topic, c.msgtype, when, memoryview(data)
+            except (ReaderError, OSError, ValueError) as error:
+                self._complain(f"{self._foreign.name}: {error}; what follows is lost")
+            return
+
+        def chosen_channel(channel: TopicType) -> bool:
+            return wanted is None or channel.topic in wanted
+
+        for file in self._files:
+            for message in file.messages(chosen_channel):
+                channel = file.channels[message.channel_id]
+                if channel.message_encoding != "cdr":
+                    self._complain(
+                        f"{channel.topic} is encoded as {channel.message_encoding!r}; expected cdr: left out"
+                    )
+                    continue
+                yield channel.topic, channel.type_name, message.log_time_ns, message.data
+
+
+def qos_profile(depth: int, *, latched: bool = True) -> dict[str, Any]:
+    """Return a reliable QoS profile as rosbag2's metadata (version 9) spells it.
+
+    Parameters
+    ----------
+    depth : int
+        How many samples are kept.
+    latched : bool
+        transient_local, which serves late and volatile subscribers alike; else volatile.
+    """
+    return {
+        "history": "keep_last",
+        "depth": depth,
+        "reliability": "reliable",
+        "durability": "transient_local" if latched else "volatile",
+        "deadline": dict(_FOREVER),
+        "lifespan": dict(_FOREVER),
+        "liveliness": "automatic",
+        "liveliness_lease_duration": dict(_FOREVER),
+        "avoid_ros_namespace_conventions": False,
+    }
+
+
+@dataclass
+class _Channel:
+    id: int
+    type_name: str
+    qos: list[dict[str, Any]]
+    digest: str
+    count: int = 0
+
+
+class BagWriter:
+    """Writes a rosbag2 directory: one MCAP file with checksums and definitions, and its metadata.
+
+    Parameters
+    ----------
+    path : path-like
+        Directory to make.
+    compress : bool
+        Chunks compressed with zstd.
+    overwrite : bool
+        Replace a bag that is there. Anything but a bag is never removed.
+    depth : int
+        Depth of the QoS that is offered on playing, for topics made without one.
+
+    Raises
+    ------
+    BagError
+        If the path is taken or cannot be made.
+    """
+
+    def __init__(
+        self, path: str | Path, *, compress: bool = True, overwrite: bool = False, depth: int = 100
+    ) -> None:
+        self.path = Path(path)
+        self._depth = depth
+        self._channels: dict[str, _Channel] = {}
+        self._schemas: dict[str, tuple[int, str]] = {}
+        self._first: int | None = None
+        self._last = 0
+        self._closed = False
+        if self.path.exists():
+            self._make_room(overwrite)
+        try:
+            self.path.mkdir(parents=True)
+            self.file = self.path / f"{self.path.resolve().name}_0.mcap"
+            self._stream = self.file.open("wb")
+        except OSError as error:
+            raise BagError(f"cannot make {self.path}: {error.strerror}") from error
+        self._writer: Any = Writer(
+            self._stream, compression=CompressionType.ZSTD if compress else CompressionType.NONE
+        )
+        self._writer.start(profile="ros2", library="csas_shadow_ros")
+
+    def _make_room(self, overwrite: bool) -> None:
+        if not overwrite:
+            raise BagError(f"{self.path} exists already; expected a new directory, or overwrite")
+        inside = list(self.path.iterdir()) if self.path.is_dir() else None
+        if inside is None or any(p.name != METADATA and p.suffix not in (".mcap", ".db3") for p in inside):
+            raise BagError(f"{self.path} is there and is no bag: not replaced")
+        shutil.rmtree(self.path)
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        # What was written up to an error is a sound bag too.
+        self.close()
+
+    def add_topic(
+        self,
+        topic: str,
+        type_name: str,
+        *,
+        depth: int | None = None,
+        latched: bool = True,
+        definition: str | None = None,
+    ) -> None:
+        """Make a topic; needed before `write` only for raw messages or a special QoS.
+
+        Parameters
+        ----------
+        topic : str
+            Absolute name.
+        type_name : str
+            ``package/msg/Name``.
+        depth, latched
+            See `qos_profile`.
+        definition : str, optional
+            ``ros2msg`` text of a type that is not in ROS 2 Jazzy's common interfaces.
+
+        Raises
+        ------
+        BagError
+            If the topic exists with another type, is not absolute, or the type is unknown.
+        """
+        if not topic.startswith("/"):
+            raise BagError(f"topic {topic!r} is not absolute; expected a leading slash")
+        if (known := self._channels.get(topic)) is not None:
+            if known.type_name != type_name:
+                raise BagError(f"{topic} is a {known.type_name}; cannot write a {type_name} to it")
+            return
+        qos = [qos_profile(self._depth if depth is None else depth, latched=latched)]
+        schema, digest = self._schema(type_name, definition)
+        channel = self._writer.register_channel(
+            topic=topic,
+            message_encoding="cdr",
+            schema_id=schema,
+            metadata={
+                "offered_qos_profiles": yaml.safe_dump(qos, sort_keys=False).strip(),
+                "topic_type_hash": digest,
+            },
+        )
+        self._channels[topic] = _Channel(channel, type_name, qos, digest)
+
+    def _schema(self, type_name: str, definition: str | None) -> tuple[int, str]:
+        if type_name not in self._schemas:
+            digest = ""
+            if definition is None:
+                store = typestore()
+                if type_name not in store.fielddefs:
+                    raise BagError(
+                        f"type {type_name!r} is unknown; expected a standard one, or its definition"
+                    )
+                definition = store.generate_msgdef(type_name, ros_version=2)[0]
+                digest = store.hash_rihs01(type_name)
+            number = self._writer.register_schema(type_name, "ros2msg", definition.encode())
+            self._schemas[type_name] = (number, digest)
+        return self._schemas[type_name]
+
+    def write(
+        self,
+        topic: str,
+        message: Any,
+        log_time_ns: int | None = None,
+        *,
+        type_name: str | None = None,
+    ) -> None:
+        """Write one message.
+
+        Parameters
+        ----------
+        topic : str
+            Absolute name.
+        message : message, bytes or memoryview
+            An rclpy or rosbags message, or CDR as it is.
+        log_time_ns : int, optional
+            When it was recorded; the header's stamp by default.
+        type_name : str, optional
+            Needed for the first raw message of a topic that was not added.
+
+        Raises
+        ------
+        BagError
+            If the bag is closed, the type does not fit the topic, or no time is known.
+        """
+        if self._closed:
+            raise BagError(f"{self.path} is closed; cannot write {topic}")
+        if isinstance(message, bytes | bytearray | memoryview):
+            data: Any = message
+            known = self._channels.get(topic)
+            type_name = type_name or (known.type_name if known else None)
+            if type_name is None:
+                raise BagError(f"{topic}: a raw message needs its type on a new topic")
+        else:
+            actual = type_name_of(message)
+            if type_name not in (None, actual):
+                raise BagError(f"{topic}: message is a {actual}; expected {type_name}")
+            type_name, data = actual, _serialise(message, actual)
+            if log_time_ns is None and hasattr(message, "header"):
+                log_time_ns = stamp_to_ns(message.header.stamp)
+        if log_time_ns is None:
+            raise BagError(f"{topic}: a message without a header needs its time")
+        self.add_topic(topic, type_name)
+        channel = self._channels[topic]
+        alone = len(data) > _OWN_CHUNK_BYTES
+        try:
+            if alone:
+                # An image shares no chunk with small messages: those are read without touching it.
+                self._writer.flush()
+            self._writer.add_message(channel.id, log_time_ns, data, log_time_ns, channel.count)
+            if alone:
+                self._writer.flush()
+        except OSError as error:
+            raise BagError(f"cannot write to {self.file}: {error.strerror}") from error
+        channel.count += 1
+        self._first = log_time_ns if self._first is None else min(self._first, log_time_ns)
+        self._last = max(self._last, log_time_ns)
+
+    def close(self) -> None:
+        """Finish the file and write the metadata; a second call does nothing.
+
+        Raises
+        ------
+        BagError
+            If the disk refuses.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        information = self._information()
+        try:
+            text = yaml.safe_dump(information, sort_keys=False)
+            self._writer.add_metadata("rosbag2", {"serialized_metadata": text})
+            self._writer.finish()
+            self._stream.close()
+            partial = self.path / f"{METADATA}.tmp"
+            whole = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
+            partial.write_text(whole, encoding="utf-8")
+            partial.replace(self.path / METADATA)
+        except (OSError, McapError) as error:
+            raise BagError(f"cannot finish {self.path}: {error}") from error
+
+    def _information(self) -> dict[str, Any]:
+        count = sum(c.count for c in self._channels.values())
+        start = self._first if self._first is not None else 0
+        times = {
+            "duration": {"nanoseconds": self._last - start if count else 0},
+            "starting_time": {"nanoseconds_since_epoch": start},
+            "message_count": count,
+        }
+        return {
+            "version": 9,
+            "storage_identifier": "mcap",
+            **times,
+            "topics_with_message_count": [
+                {
+                    "topic_metadata": {
+                        "name": topic,
+                        "type": c.type_name,
+                        "serialization_format": "cdr",
+                        "offered_qos_profiles": c.qos,
+                        "type_description_hash": c.digest,
+                    },
+                    "message_count": c.count,
+                }
+                for topic, c in self._channels.items()
+            ],
+            "compression_format": "",
+            "compression_mode": "",
+            "relative_file_paths": [self.file.name],
+            "files": [{"path": self.file.name, **times}],
+            "custom_data": None,
+            "ros_distro": "jazzy",
+        }
+
+
+def _serialise(message: Any, type_name: str) -> Any:
+    try:
+        if hasattr(message, "__msgtype__"):
+            return typestore().serialize_cdr(message, type_name)
+        from rclpy.serialization import serialize_message
+
+        return serialize_message(message)
+    except (SerdeError, AdapterError, TypeError, ValueError, AttributeError) as error:
+        raise BagError(f"cannot serialise {type_name}: {error}") from error
+
+
+def copy(reader: BagReader, writer: BagWriter, keep: Callable[[BagMessage], bool] | None = None) -> int:
+    """Copy messages from bag to bag as they are; return how many."""
+    n = 0
+    for message in reader.messages():
+        if keep is None or keep(message):
+            writer.write(message.topic, message.cdr, message.log_time_ns, type_name=message.type_name)
+            n += 1
+    return n

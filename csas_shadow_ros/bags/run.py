@@ -1,0 +1,382 @@
+"""Whole runs: the image (or its sectors), the track and any later stage's views, from and to a bag."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from csas_shadow_ros.core.errors import BagError, CsasError
+from csas_shadow_ros.core.geometry import CoherentImage, Track, View
+from csas_shadow_ros.core.sector import Sector, image_from_sectors
+from msg_adapters.image import largest_part, quantise
+from msg_adapters.messages import RosbagsMessages, stamp_to_ns
+from msg_adapters.pairs import (
+    coherent_image_from_msgs,
+    coherent_image_to_msgs,
+    sector_from_msgs,
+    sector_to_msgs,
+    view_from_msgs,
+)
+from msg_adapters.topics import (
+    COMPLEX_ENCODINGS,
+    NAMESPACE,
+    STREAMS,
+    TOPICS,
+    VIEW_STREAMS,
+    absolute_name,
+    stream,
+)
+from msg_adapters.track import track_from_msg, track_to_msg
+
+from .bag import BagMessage, BagReader, BagWriter
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong in a bag.
+
+    Parameters
+    ----------
+    topic : str
+        Absolute name; empty if it concerns the bag itself.
+    number : int or None
+        Which message of that topic, from 0.
+    stamp_ns : int or None
+        The message's stamp.
+    reason : str
+        What is wrong.
+    """
+
+    topic: str
+    number: int | None
+    stamp_ns: int | None
+    reason: str
+
+    def __str__(self) -> str:
+        place = self.topic
+        if self.number is not None:
+            place += f" message {self.number}"
+        if self.stamp_ns is not None:
+            place += f" ({self.stamp_ns} ns)"
+        return f"{place}: {self.reason}" if place else self.reason
+
+
+@dataclass
+class Run:
+    """What a bag holds of a run.
+
+    The full-circle image and the track are read at once, views and sectors as they are iterated. A
+    message that breaks the contract is left out and is one entry of `problems`.
+
+    Parameters
+    ----------
+    path : Path
+        The bag.
+    namespace : str
+        Namespace of its topics.
+    image : CoherentImage or None
+        The full-circle image, if the bag holds one.
+    track : Track or None
+        The track, if the bag holds one.
+    counts : dict
+        Number of image messages of each stream that the bag holds.
+    problems : list of Problem
+        What was wrong so far; grows while views are iterated.
+    """
+
+    path: Path
+    namespace: str
+    image: CoherentImage | None
+    track: Track | None
+    counts: dict[str, int]
+    problems: list[Problem] = field(default_factory=list)
+    _reader: BagReader | None = None
+
+    def views(self, stream_name: str) -> Iterator[View]:
+        """Iterate the views of a stage: `sub_aperture`, `shadow`, `likelihood` or `shadow_mask`.
+
+        Raises
+        ------
+        BagError
+            If the stream holds no views.
+        """
+        if stream_name not in VIEW_STREAMS:
+            raise BagError(f"{stream_name!r} holds no views; expected one of: {', '.join(VIEW_STREAMS)}")
+        return self._each(stream_name, lambda image, info: view_from_msgs(image, info, stream_name))
+
+    def sectors(self) -> Iterator[Sector]:
+        """Iterate the sectors."""
+        return self._each("sector", sector_from_msgs)
+
+    def coherent_image(self) -> CoherentImage:
+        """Return the full-circle image; summed from the sectors if the bag has those instead.
+
+        Raises
+        ------
+        BagError
+            If it has neither; the message names what is wrong with them.
+        """
+        if self.image is not None:
+            return self.image
+        if self.counts.get("sector"):
+            try:
+                return image_from_sectors(self.sectors())
+            except CsasError as error:
+                raise BagError(self._why(f"no image can be summed from the sectors ({error})")) from error
+        raise BagError(self._why("there is no full-circle image"))
+
+    def require_track(self) -> Track:
+        """Return the track.
+
+        Raises
+        ------
+        BagError
+            If there is none; the message names what is wrong with it.
+        """
+        if self.track is None:
+            raise BagError(self._why("there is no track"))
+        return self.track
+
+    def _why(self, lack: str) -> str:
+        found = f": {self.problems[0]}" if self.problems else ""
+        more = f" (and {len(self.problems) - 1} more problems)" if len(self.problems) > 1 else ""
+        return f"{self.path}: {lack}{found}{more}"
+
+    def _each(self, stream_name: str, read: Callable[[Any, Any], T]) -> Iterator[T]:
+        if self._reader is None:
+            return
+        for pair in iterate_pairs(self._reader, stream_name, self.report):
+            try:
+                yield read(pair.image, pair.info)
+            except CsasError as error:
+                self.report(Problem(pair.topic, pair.number, pair.stamp_ns, str(error)))
+
+    def report(self, problem: Problem) -> None:
+        """Note a problem; the same one only once."""
+        if problem not in self.problems:
+            self.problems.append(problem)
+
+
+@dataclass(frozen=True, eq=False)
+class MessagePair:
+    """An image and its camera_info, decoded but not checked."""
+
+    topic: str
+    number: int
+    stamp_ns: int
+    image: Any
+    info: Any
+
+
+def checked_messages(
+    reader: BagReader, relative: str, report: Callable[[Problem], None]
+) -> Iterator[tuple[BagMessage, Any, int]]:
+    """Iterate (message, decoded, stamp) of a topic; a stamp that comes again is passed over.
+
+    A latched message may be recorded several times: the same stamp with the same bytes counts once,
+    with other bytes it is reported.
+    """
+    info = reader.topic(relative)
+    if info is None:
+        return
+    expected = TOPICS[relative].type_name
+    if info.type_name != expected:
+        report(Problem(info.name, None, None, f"its type is {info.type_name!r}; expected {expected}"))
+        return
+    seen: dict[int, bytes] = {}
+    for message in reader.messages([info.name]):
+        try:
+            decoded = message.decode()
+            stamp = stamp_to_ns(decoded.header.stamp)
+        except CsasError as error:
+            report(Problem(info.name, message.number, None, str(error)))
+            continue
+        digest = hashlib.blake2b(message.cdr, digest_size=16).digest()
+        if stamp in seen:
+            if seen[stamp] != digest:
+                reason = "differs from an earlier message of the same stamp"
+                report(Problem(info.name, message.number, stamp, reason))
+            continue
+        seen[stamp] = digest
+        yield message, decoded, stamp
+
+
+def iterate_pairs(
+    reader: BagReader, stream_name: str, report: Callable[[Problem], None]
+) -> Iterator[MessagePair]:
+    """Iterate a stream's images with the camera_info of the same stamp, whatever their order.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The bag.
+    stream_name : str
+        Name of the image stream.
+    report : callable
+        Called with each `Problem`: other types, undecodable messages, lonely images and infos.
+    """
+    kind = stream(stream_name)
+    info_topic = absolute_name(kind.info_topic, reader.namespace)
+    # Camera infos are small: all are read first, so that no image ever waits in memory.
+    infos = {s: (m.number, d) for m, d, s in checked_messages(reader, kind.info_topic, report)}
+    used: set[int] = set()
+    for message, image, stamp in checked_messages(reader, kind.image_topic, report):
+        if stamp not in infos:
+            missing = f"has no camera_info of the same stamp on {info_topic}"
+            if infos:
+                nearest = min(infos, key=lambda s: abs(s - stamp))
+                missing += f" (the nearest is {nearest} ns)"
+            report(Problem(message.topic, message.number, stamp, missing))
+            continue
+        used.add(stamp)
+        yield MessagePair(message.topic, message.number, stamp, image, infos[stamp][1])
+    for stamp, (number, _) in infos.items():
+        if stamp not in used:
+            report(Problem(info_topic, number, stamp, "has no image of the same stamp"))
+
+
+def read_run(path: str | Path, namespace: str | None = None) -> Run:
+    """Read a run from a bag.
+
+    Parameters
+    ----------
+    path : path-like
+        A rosbag2 directory or a lone storage file.
+    namespace : str, optional
+        Namespace of its topics; found by itself if not given.
+
+    Returns
+    -------
+    Run
+        With `image` or `track` None where the bag has no usable one; `problems` says why.
+
+    Raises
+    ------
+    BagError
+        If there is no bag to read.
+    """
+    reader = BagReader(path, namespace)
+    found = {name: reader.topic(s.image_topic) for name, s in STREAMS.items()}
+    counts = {name: info.count for name, info in found.items() if info is not None and info.count}
+    run = Run(Path(path), reader.namespace, None, None, counts, [], reader)
+    run.image = _one_image(run, reader)
+    run.track = _longest_track(run, reader)
+    for line in reader.problems:
+        run.report(Problem("", None, None, line))
+    return run
+
+
+def _one_image(run: Run, reader: BagReader) -> CoherentImage | None:
+    image: CoherentImage | None = None
+    for pair in iterate_pairs(reader, "image", run.report):
+        if image is not None:
+            reason = "is a second image; the first is used"
+            run.report(Problem(pair.topic, pair.number, pair.stamp_ns, reason))
+            continue
+        try:
+            image = coherent_image_from_msgs(pair.image, pair.info)
+        except CsasError as error:
+            run.report(Problem(pair.topic, pair.number, pair.stamp_ns, str(error)))
+    return image
+
+
+def _longest_track(run: Run, reader: BagReader) -> Track | None:
+    # A track that grows during the run is published again and again: the longest is the whole.
+    best: Track | None = None
+    for message, path, stamp in checked_messages(reader, "track", run.report):
+        try:
+            track = track_from_msg(path)
+        except CsasError as error:
+            run.report(Problem(message.topic, message.number, stamp, str(error)))
+            continue
+        if best is None or len(track) >= len(best):
+            best = track
+    return best
+
+
+def write_run(
+    path: str | Path,
+    image: CoherentImage | None,
+    track: Track | None,
+    *,
+    encoding: str = "32FC2",
+    compress: bool = True,
+    overwrite: bool = False,
+    namespace: str = NAMESPACE,
+    sectors: Iterable[Sector] = (),
+    extra: Iterable[tuple[str, Any]] = (),
+) -> Path:
+    """Write a run as a rosbag2 directory that any ROS 2 tool opens.
+
+    Parameters
+    ----------
+    path : path-like
+        Directory to make.
+    image : CoherentImage or None
+        The full-circle image.
+    track : Track or None
+        The track.
+    encoding : str
+        ``32FC2``, ``64FC2``, or ``16SC2`` and ``8SC2``: then the image is scaled so that its largest
+        part fills the integers, and rounded; all sectors by one scale, so that they still sum.
+    compress : bool
+        zstd chunks.
+    overwrite : bool
+        Replace a bag that is there.
+    namespace : str
+        Namespace of the topics.
+    sectors : iterable of Sector
+        Sectors, instead of the image or besides it.
+    extra : iterable of (str, message)
+        More stamped messages (rclpy or rosbags), by relative or absolute topic.
+
+    Returns
+    -------
+    Path
+        The directory.
+
+    Raises
+    ------
+    BagError
+        If the path is taken or the encoding is unknown.
+    AdapterError
+        If something to be written breaks the contract.
+    """
+    if encoding not in COMPLEX_ENCODINGS:
+        raise BagError(f"encoding is {encoding!r}; expected one of: {', '.join(COMPLEX_ENCODINGS)}")
+    integers = encoding in ("8SC2", "16SC2")
+    factory = RosbagsMessages()
+    # Everything of the run was known when its last pose was: nothing waits when the bag is played.
+    when = max(image.stamp_ns if image else 0, int(track.stamps_ns[-1]) if track else 0)
+
+    def name(relative: str) -> str:
+        return absolute_name(relative, namespace)
+
+    with BagWriter(path, compress=compress, overwrite=overwrite) as writer:
+        for latched in ("image", "camera_info", "track"):
+            if track if latched == "track" else image:
+                writer.add_topic(name(latched), TOPICS[latched].type_name, depth=1)
+        if track is not None:
+            writer.write(name("track"), track_to_msg(factory, track), when)
+        if integers:
+            sectors = list(sectors)
+            peak = max((largest_part(s.pixels) for s in sectors), default=0.0)
+            sectors = [replace(s, pixels=quantise(s.pixels, encoding, peak)) for s in sectors]
+        for sector in sectors:
+            a, b = sector_to_msgs(factory, sector, encoding)
+            writer.write(name("sector/camera_info"), b)
+            writer.write(name("sector/image"), a)
+        if image is not None:
+            if integers:
+                image = replace(image, pixels=quantise(image.pixels, encoding))
+            a, b = coherent_image_to_msgs(factory, image, encoding)
+            writer.write(name("camera_info"), b, when)
+            writer.write(name("image"), a, when)
+        for topic, message in extra:
+            writer.write(name(topic), message)
+    return Path(path)
