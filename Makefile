@@ -1,0 +1,80 @@
+# Everything from nothing: `make demo` and `make test` set up what they need.
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+
+VENV ?= .venv
+COLCON_VENV ?= .venv-colcon
+# Any Python 3.10 to 3.13; the first of these that runs and is one.
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3.10 python3; do \
+	$$p -c 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' \
+	>/dev/null 2>&1 && { echo $$p; break; }; done)
+PY := $(VENV)/bin/python
+DEMO_BAG ?= bags/demo
+DEMO_OUT ?= results/demo
+PYTEST_WORKERS ?= 2
+
+# ROS 2 from PyPI needs its prefix named, stays on this machine, and wants a place for its logs.
+export AMENT_PREFIX_PATH := $(abspath $(VENV))$(if $(AMENT_PREFIX_PATH),:$(AMENT_PREFIX_PATH))
+export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
+export ROS_LOG_DIR ?= $(abspath .ros_log)
+unexport PYTHONPATH
+
+SOURCES := $(shell find csas_shadow_ros msg_adapters config launch -type f \
+	-not -name '*.pyc' -not -path '*/__pycache__*' 2>/dev/null)
+PACKAGING := setup.py setup.cfg pyproject.toml package.xml
+
+.PHONY: help venv install demo test lint types unit build clean
+
+help: ## list the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 18
+
+venv: $(VENV)/.created ## make the virtual environment
+
+$(VENV)/.created:
+	@test -n "$(PYTHON)" || { echo "no Python 3.10 to 3.13 with venv found: name one, make PYTHON=..." >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	touch $@
+
+# The dependencies once (they change with the packaging), the package itself whenever a file of it changed.
+$(VENV)/.dependencies: $(VENV)/.created setup.py pyproject.toml
+	$(PY) -m pip install --quiet --disable-pip-version-check 'setuptools>=68,<80' wheel
+	$(PY) -m pip install --quiet --disable-pip-version-check '.[ros,test]'
+	touch $@
+
+$(VENV)/.installed: $(VENV)/.dependencies $(PACKAGING) $(SOURCES)
+	rm -rf build/lib build/bdist.* build/ros2_run
+	$(PY) -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall .
+	touch $@
+
+install: $(VENV)/.installed ## install the package and ROS 2 into it
+
+demo: install ## replay the demonstration bag
+	@mkdir -p $(ROS_LOG_DIR)
+	$(VENV)/bin/csas-shadow replay $(DEMO_BAG) --out $(DEMO_OUT)
+
+test: install lint types unit ## lint, types and all tests
+
+lint: install ## ruff
+	$(VENV)/bin/ruff check .
+
+types: install ## mypy
+	$(VENV)/bin/mypy
+
+unit: install ## pytest alone
+	@mkdir -p $(ROS_LOG_DIR)
+	$(PY) -m pytest -n $(PYTEST_WORKERS)
+
+$(COLCON_VENV)/.installed: setup.py
+	@test -n "$(PYTHON)" || { echo "no Python 3.10 to 3.13 with venv found: name one, make PYTHON=..." >&2; exit 1; }
+	$(PYTHON) -m venv $(COLCON_VENV)
+	$(COLCON_VENV)/bin/pip install --quiet --disable-pip-version-check 'colcon-common-extensions>=0.3' 'setuptools>=68,<80'
+	touch $@
+
+build: $(COLCON_VENV)/.installed ## colcon build, with colcon from PyPI
+	PATH="$(abspath $(COLCON_VENV))/bin:$$PATH" colcon build --packages-select csas_shadow_ros \
+		--base-paths . --event-handlers console_direct+
+
+clean: ## remove what the others made
+	rm -rf $(VENV) $(COLCON_VENV) build install log results dist .ros_log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,124 @@
+"""Packaging: colcon (ament_python), pip and ``ros2 run`` all install the package from here."""
+
+import os
+import sys
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "csas_shadow_ros"
+NODES = (
+    "sub_aperture",
+    "shadow_enhancement",
+    "shadow_likelihood",
+    "voxel_carver",
+    "composites",
+    "bag_player",
+    "bag_recorder",
+)
+
+CORE = [
+    "numpy>=1.26",
+    "scipy>=1.11",
+    "scikit-image>=0.22",
+    "trimesh>=4.4",
+    "opencv-python-headless>=4.8",
+    "numba>=0.60",
+    "ducc0>=0.34",
+    "matplotlib>=3.8",
+    "tqdm>=4.66",
+    "PyYAML>=6.0",
+    "mcap>=1.2",
+    "zstandard>=0.22",
+    "lz4>=4.3",
+    # The bag format's reader and message definitions: its interface moves between minor versions.
+    "rosbags>=0.11,<0.12",
+    # Ray casting of simulated scenes; an x86-64 and arm64 wheel exists for every supported Python.
+    "embreex>=2.17.7",
+]
+# ROS 2 Jazzy from PyPI, in versions that were tried together. Where ROS 2 is installed by other means
+# (apt, conda, source) this extra is not needed and would be in the way.
+ROS = ["ros-rclpy==7.1.6", "ros-rmw-fastrtps-cpp==8.4.3", "ros-common-interfaces==5.3.6"]
+TEST = ["pytest>=8", "pytest-xdist>=3.5", "hypothesis>=6.100", "ruff>=0.6", "mypy>=1.11"]
+# setuptools 80 dropped what colcon's --symlink-install calls.
+BUILD = ["colcon-common-extensions>=0.3", "setuptools>=68,<80"]
+
+ROOT = Path(__file__).resolve().parent
+
+
+def version() -> str:
+    """Read the version from the package, which is its one home."""
+    text = (ROOT / NAME / "__init__.py").read_text(encoding="utf-8")
+    return text.split('__version__ = "', 1)[1].split('"', 1)[0]
+
+
+def read_me() -> str:
+    """Return the README, empty in a tree without one."""
+    path = ROOT / "README.md"
+    return path.read_text(encoding="utf-8") if path.exists() else ""
+
+
+def files_below(folder: str) -> list[tuple[str, list[str]]]:
+    """Return data_files entries that keep a folder's layout below share/NAME."""
+    found = []
+    for path, _, _ in os.walk(folder):
+        files = sorted(f for f in glob(f"{path}/*") if os.path.isfile(f) and not f.endswith(".pyc"))
+        if files and "__pycache__" not in path:
+            found.append((f"share/{NAME}/{path}", files))
+    return found
+
+
+def node_scripts() -> list[tuple[str, list[str]]]:
+    """Make what ``ros2 run`` looks for when pip installs a wheel.
+
+    pip ignores setup.cfg's install_scripts (which serves colcon) and puts console scripts into bin/;
+    ``ros2 run`` looks in lib/NAME. So a wheel carries one small script a node there.
+    """
+    if "bdist_wheel" not in sys.argv:
+        return []
+    folder = Path("build") / "ros2_run"
+    folder.mkdir(parents=True, exist_ok=True)
+    scripts = []
+    for node in NODES:
+        script = folder / node
+        script.write_text(f'#!/bin/sh\nexec "$(dirname "$0")/../../bin/{node}" "$@"\n', encoding="utf-8")
+        script.chmod(0o755)
+        scripts.append(str(script))
+    return [(f"lib/{NAME}", scripts)]
+
+
+setup(
+    name=NAME,
+    version=version(),
+    description="Shadow enhancement, sub-aperture imagery and 3-D space carving for circular SAS, in ROS 2",
+    long_description=read_me(),
+    long_description_content_type="text/markdown",
+    author="The csas_shadow_ros authors",
+    author_email="csas-shadow-ros@example.com",
+    maintainer="The csas_shadow_ros authors",
+    maintainer_email="csas-shadow-ros@example.com",
+    license="MIT",
+    python_requires=">=3.10,<3.14",
+    packages=find_packages(include=[f"{NAME}*", "msg_adapters*"]),
+    package_data={
+        NAME: ["py.typed", "**/*.html", "**/*.js", "**/*.css", "**/*.svg", "**/*.xml", "**/*.yaml"],
+        "msg_adapters": ["py.typed"],
+    },
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        *files_below("launch"),
+        *files_below("config"),
+        *node_scripts(),
+    ],
+    install_requires=CORE,
+    extras_require={"ros": ROS, "test": TEST, "build": BUILD, "dev": TEST + BUILD},
+    entry_points={
+        "console_scripts": [
+            "csas-shadow = csas_shadow_ros.cli:main",
+            *(f"{node} = {NAME}.nodes.{node}:main" for node in NODES),
+        ]
+    },
+    zip_safe=False,
+)
