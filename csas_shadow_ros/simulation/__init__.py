@@ -1,17 +1,25 @@
 """Seeded simulations of circular SAS runs with their truth: scenes, runs, bags of them, and shadow hulls."""
 
+from .bag import simulate_bag
+from .hull import iou, shadow_hull, voxelise_truth
 from .profiles import PROFILES, Faults, Profile, get_profile
 from .run import SimulatedRun, Truth, simulate
-from .targets import TARGETS, make_scene
+from .targets import TARGETS, Scene, load_mesh, make_scene
 
 __all__ = [
     "PROFILES",
     "TARGETS",
     "Faults",
     "Profile",
+    "Scene",
     "SimulatedRun",
     "Truth",
     "get_profile",
+    "iou",
+    "load_mesh",
     "make_scene",
+    "shadow_hull",
     "simulate",
+    "simulate_bag",
+    "voxelise_truth",
 ]

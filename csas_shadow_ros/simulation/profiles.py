@@ -201,6 +201,8 @@ def _check_arcs(arcs: Iterable[tuple[float, float]]) -> tuple[tuple[float, float
         except (TypeError, ValueError):
             raise ParameterError(f"missing arc is {arc!r}; expected (start, stop) in degrees") from None
         if not 0.0 < stop - start < 360.0:
-            raise ParameterError(f"missing arc is ({start:g}, {stop:g}) deg; expected start < stop < start + 360")
+            raise ParameterError(
+                f"missing arc is ({start:g}, {stop:g}) deg; expected start < stop < start + 360"
+            )
         checked.append((start, stop))
     return tuple(checked)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(nogil=True, cache=True)
 def fill_triangles(triangles: NDArray[np.float64], out: NDArray[np.uint8]) -> None:  # pragma: no cover
     """Set out[v, u] = 1 where the lattice point (u, v) lies inside any triangle.
 
@@ -28,8 +28,8 @@ def fill_triangles(triangles: NDArray[np.float64], out: NDArray[np.uint8]) -> No
     for t in range(triangles.shape[0]):
         v_low = min(triangles[t, 0, 1], triangles[t, 1, 1], triangles[t, 2, 1])
         v_high = max(triangles[t, 0, 1], triangles[t, 1, 1], triangles[t, 2, 1])
-        first = max(0, int(math.ceil(max(v_low, -1.0))))
-        last = min(rows - 1, int(math.floor(min(v_high, rows * 1.0))))
+        first = max(0, math.ceil(max(v_low, -1.0)))
+        last = min(rows - 1, math.floor(min(v_high, rows * 1.0)))
         for v in range(first, last + 1):
             left, right = 1e30, -1e30
             for i in range(3):
@@ -44,11 +44,11 @@ def fill_triangles(triangles: NDArray[np.float64], out: NDArray[np.uint8]) -> No
                         left, right = min(left, u), max(right, u)
             if right < 0.0 or left > cols - 1:
                 continue
-            for u in range(max(0, int(math.ceil(left))), min(cols - 1, int(math.floor(right))) + 1):
+            for u in range(max(0, math.ceil(left)), min(cols - 1, math.floor(right)) + 1):
                 out[v, u] = 1
 
 
-@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(nogil=True, cache=True)
 def add_windings(triangles: NDArray[np.float64], out: NDArray[np.int16]) -> None:  # pragma: no cover
     """Add ±1 at the voxel just under each crossing of a vertical line of voxel centres with a triangle.
 
@@ -71,8 +71,8 @@ def add_windings(triangles: NDArray[np.float64], out: NDArray[np.int16]) -> None
         if area == 0.0:
             continue
         sign = 1 if area > 0 else -1
-        x_first, x_last = max(0, int(math.ceil(min(ax, bx, cx)))), min(nx - 1, int(math.floor(max(ax, bx, cx))))
-        y_first, y_last = max(0, int(math.ceil(min(ay, by, cy)))), min(ny - 1, int(math.floor(max(ay, by, cy))))
+        x_first, x_last = max(0, math.ceil(min(ax, bx, cx))), min(nx - 1, math.floor(max(ax, bx, cx)))
+        y_first, y_last = max(0, math.ceil(min(ay, by, cy))), min(ny - 1, math.floor(max(ay, by, cy)))
         for y in range(y_first, y_last + 1):
             for x in range(x_first, x_last + 1):
                 wa = ((bx - x) * (cy - y) - (by - y) * (cx - x)) / area
@@ -81,12 +81,12 @@ def add_windings(triangles: NDArray[np.float64], out: NDArray[np.int16]) -> None
                 if wa < 0.0 or wb < 0.0 or wc < 0.0:
                     continue
                 z = wa * az + wb * bz + wc * cz
-                k = min(nz - 1, int(math.floor(z)))
+                k = min(nz - 1, math.floor(z))
                 if k >= 0:
                     out[k, y, x] += sign
 
 
-@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(nogil=True, cache=True)
 def keep_shadowed(
     alive: NDArray[np.bool_],
     axes: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
@@ -95,7 +95,7 @@ def keep_shadowed(
     origin: tuple[float, float],
     spacing: float,
 ) -> None:  # pragma: no cover
-    """Remove the voxels whose shadow point falls outside a silhouette drawn on the seabed.
+    """Remove the voxels whose shadow point has no lattice point of a silhouette round it.
 
     Parameters
     ----------
@@ -106,7 +106,11 @@ def keep_shadowed(
     sonar : ndarray, shape (3,)
         Sonar position.
     silhouette : ndarray of uint8, shape (rows, cols)
-        1 in shadow; point (u, v) lies at origin + (u, v) spacing.
+        1 in shadow, on the seabed.
+    origin : (float, float)
+        Scene x, y of its lattice point (0, 0); rows grow along +y here.
+    spacing : float
+        Its spacing, metres.
     """
     nz, ny, nx = alive.shape
     rows, cols = silhouette.shape
@@ -115,11 +119,16 @@ def keep_shadowed(
         scale = sonar[2] / (sonar[2] - zs[k])
         for j in range(ny):
             v = (sonar[1] + (ys[j] - sonar[1]) * scale - origin[1]) / spacing
-            row = int(math.floor(v + 0.5))
+            row = math.floor(v)
             for i in range(nx):
                 if not alive[k, j, i]:
                     continue
                 u = (sonar[0] + (xs[i] - sonar[0]) * scale - origin[0]) / spacing
-                col = int(math.floor(u + 0.5))
-                if row < 0 or row >= rows or col < 0 or col >= cols or silhouette[row, col] == 0:
-                    alive[k, j, i] = False
+                col = math.floor(u)
+                on_lattice = 0 <= row < rows - 1 and 0 <= col < cols - 1
+                alive[k, j, i] = on_lattice and (
+                    silhouette[row, col] > 0
+                    or silhouette[row, col + 1] > 0
+                    or silhouette[row + 1, col] > 0
+                    or silhouette[row + 1, col + 1] > 0
+                )

@@ -2,8 +2,8 @@ r"""Simulate a circular SAS run: a complex image, its track, and the truth.
 
 The image is made in its spectrum, I(x, y) = Σ S(K) exp(+jK·(x, y)) over the image's own lattice of
 wavenumbers. Energy seen from aspect θ lies on the ray K û(θ), in the annulus of the band, so the
-annulus is cut into wedges ("blocks", 0.5° wide): every lattice wavenumber belongs to exactly one, and that block's
-sonar position decides what it sees:
+annulus is cut into wedges ("blocks", 0.5° wide): every lattice wavenumber belongs to exactly one, and
+that block's sonar position decides what it sees:
 
     S(K) = exp(jφ(K)) [ F{ M_b r }(K) + ρ^½ Σ_n a_n exp(-jK·p_n,b) ] + noise,      K in wedge b
 
@@ -282,7 +282,7 @@ class _BlockMaker:
         self.margin = np.ceil(extent / (2.0 * profile.edge_m)).astype(int)
 
     def make(self, block: int, sonar_m: FloatArray, aspect_rad: float) -> NDArray[np.complex64] | None:
-        """Return S at the block's wavenumbers without noise, seabed of unit variance; None if they are lost."""
+        """Return S at the block's wavenumbers, seabed of unit variance, no noise; None if all are lost."""
         part = slice(int(self.wedges.starts[block]), int(self.wedges.starts[block + 1]))
         q, p = self.wedges.q[part], self.wedges.p[part]
         if len(q) == 0:
@@ -418,9 +418,8 @@ def simulate(
         echo_db=echo_db,
         scatterer_spacing_m=math.pi / (k_high - k_low),
         cable_db=15.0,
-        ground_wavenumber=k_centre,
-        # A cell of a 12° sub-aperture, the width that cables are looked for with.
-        glint_cell_m2=(TWO_PI / (k_high - k_low)) * (TWO_PI / (k_centre * math.radians(12.0))),
+        # The cell of a 12° sub-aperture, the width that cables are looked for with.
+        cell_m=(TWO_PI / (k_high - k_low), TWO_PI / (k_centre * math.radians(12.0))),
     )
     wedges = Wedges.of(profile)
     seabed = _white(streams[2], (profile.rows, profile.cols))
@@ -438,7 +437,9 @@ def simulate(
     spectrum = np.zeros((profile.rows, profile.cols), dtype=np.complex64)
     blocks = len(wedges)
     aspects = (np.arange(blocks) + 0.5) * (TWO_PI / blocks)
-    sonar = orbit.at(aspects)
+    sonar = orbit.at(aspects.astype(np.float64))
+
+    threads = workers or os.cpu_count() or 1
 
     def work(block: int) -> None:
         made = maker.make(block, sonar[block], float(aspects[block]))
@@ -452,13 +453,11 @@ def simulate(
         made = made * seabed_scale + noise[part] * kept
         spectrum[wedges.q[part], wedges.p[part]] = made  # negative indices count from the end
 
-    with ThreadPoolExecutor(max_workers=workers or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(max_workers=threads) as pool:
         for done, _ in enumerate(pool.map(work, range(blocks)), start=1):
             if progress is not None:
                 progress(done, blocks)
-    del seabed, noise, maker
-
-    pixels = scipy.fft.ifft2(spectrum, norm="forward", overwrite_x=True, workers=workers or os.cpu_count() or 1)
+    pixels = scipy.fft.ifft2(spectrum, norm="forward", overwrite_x=True, workers=threads)
     if spectrum_sign == -1:
         np.conjugate(pixels, out=pixels)
     stamps, positions = _poses(profile, orbit, faults, clockwise, start_aspect_deg)

@@ -6,9 +6,9 @@ already covers it.
 
 Echoes. Surfaces are rough: a fixed set of scatterers with complex Gaussian amplitudes, spread evenly over
 the mesh. One of area dA returns power  ρ g cos²i dA,  ρ the seabed's power per square metre, g the
-target's strength and i the angle of incidence (Lambert's law), if it faces the sonar and nothing hides it. Cables
-are smooth instead: their scatterers are in phase, so they glint where they lie across the line of sight and
-are dark elsewhere.
+target's strength and i the angle of incidence (Lambert's law), if it faces the sonar and nothing hides
+it. Cables are smooth instead: their scatterers are in phase, so they glint where they lie across the line
+of sight and are dark elsewhere.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from ..core.errors import GeometryError
 from ..core.geometry import GroundGrid
 from .raster import fill_triangles
-from .targets import Scene
+from .targets import Scene, join_bodies
 
 FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 SUPERSAMPLING = 4
 _RAY_LIFT_M = 1e-3  # rays start this far off the surface, beyond the tracer's float32 rounding
@@ -75,11 +76,9 @@ class SceneModel:
     scatterer_spacing_m : float
         Mean distance between scatterers.
     cable_db : float
-        Peak of a cable's glint over the seabed's echo in a resolution cell of `glint_cell_m2`.
-    ground_wavenumber : float
-        K(f_c), rad/m: cables are as bright as their first Fresnel zone.
-    glint_cell_m2 : float
-        Area of that cell.
+        A cable's glint over the seabed's echo in a resolution cell of `cell_m`.
+    cell_m : (float, float)
+        That cell along range and cross-range.
     """
 
     def __init__(
@@ -90,25 +89,23 @@ class SceneModel:
         echo_db: float,
         scatterer_spacing_m: float,
         cable_db: float,
-        ground_wavenumber: float,
-        glint_cell_m2: float,
+        cell_m: tuple[float, float],
     ) -> None:
         rng = np.random.default_rng([seed, 0x7A])
         solids = [m for m in (scene.target, scene.decor) if len(m.faces)]
         self._has_solids = bool(solids)
+        self._points: FloatArray = np.zeros((0, 3))
+        self._normals: FloatArray = np.zeros((0, 3))
+        self._amplitudes: ComplexArray = np.zeros(0, dtype=np.complex128)
         if self._has_solids:
-            solid = trimesh.util.concatenate(solids)
+            solid = join_bodies(solids)
             self._triangles = np.asarray(solid.triangles, dtype=np.float64)
             self._face_normals = np.asarray(solid.face_normals, dtype=np.float64)
             self._tracer = EmbreeScene()
             TriangleMesh(self._tracer, self._triangles.astype(np.float32))
             self._scatter_on(solid, rng, echo_db, scatterer_spacing_m)
-        else:
-            self._points = np.zeros((0, 3))
-            self._normals = np.zeros((0, 3))
-            self._amplitudes = np.zeros(0, dtype=np.complex128)
         self._cables = np.concatenate(scene.cables) if scene.cables else np.zeros((0, 3))
-        self._cable_amplitudes = self._cable_strength(scene.cables, cable_db, ground_wavenumber, glint_cell_m2)
+        self._cable_amplitudes = self._cable_strength(scene.cables, cable_db, cell_m)
 
     @property
     def is_empty(self) -> bool:
@@ -128,29 +125,25 @@ class SceneModel:
         points = (1 - r1)[:, None] * a + (r1 * (1 - r2))[:, None] * b + (r1 * r2)[:, None] * c
         gaussian = (rng.standard_normal(count) + 1j * rng.standard_normal(count)) / math.sqrt(2.0)
         normals = self._face_normals[faces]
-        keep = normals[:, 2] > -0.999  # undersides on the seabed never echo
+        keep = normals[:, 2] > -0.999  # no sonar is under the scene
         power = 10.0 ** (echo_db / 10.0) * float(solid.area) / count
         self._points, self._normals = points[keep], normals[keep]
         self._amplitudes = math.sqrt(power) * gaussian[keep]
 
     @staticmethod
     def _cable_strength(
-        cables: tuple[FloatArray, ...], cable_db: float, k_centre: float, cell_m2: float
+        cables: tuple[FloatArray, ...], cable_db: float, cell_m: tuple[float, float]
     ) -> FloatArray:
-        """Amplitude of each point of in-phase cables.
+        """Return the amplitude of each point of in-phase cables.
 
-        The phase 2·K/2·t²/ρ of a line with radius of curvature ρ stays within half a turn over
-        sqrt(2π ρ / K), so a glint adds up that length; its power is set against the seabed's in a cell.
+        A cable across the line of sight adds up in phase over the length of a resolution cell; that sum is
+        set against the seabed's power in the cell.
         """
+        peak = math.sqrt(10.0 ** (cable_db / 10.0) * cell_m[0] * cell_m[1])
         strengths = [np.zeros(0)]
         for points in cables:
-            step = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)
-            heading = np.unwrap(np.arctan2(*np.diff(points[:, :2], axis=0).T[::-1]))
-            bend = max(abs(float(heading[-1] - heading[0])) / float(step.sum()), 1e-6)
-            fresnel = math.sqrt(2.0 * math.pi / (bend * k_centre))
-            in_zone = fresnel / float(step.mean())
-            peak = math.sqrt(10.0 ** (cable_db / 10.0) * cell_m2)
-            strengths.append(np.full(len(points), peak / in_zone))
+            step = float(np.linalg.norm(np.diff(points, axis=0), axis=1).mean())
+            strengths.append(np.full(len(points), peak * step / cell_m[1]))
         return np.concatenate(strengths)
 
     def lit_fraction(self, sonar_m: FloatArray, grid: GroundGrid, rows: int, cols: int) -> Any:
@@ -175,7 +168,6 @@ class SceneModel:
         none = (None, (slice(0, 0), slice(0, 0)))
         if not self._has_solids:
             return none
-        # Projected triangles wind counter-clockwise where they face the sonar.
         facing = np.einsum("ij,ij->i", self._face_normals, sonar_m - self._triangles[:, 0]) > 0.0
         shadow = project_shadow(self._triangles[facing], sonar_m)
         uv = np.empty_like(shadow)
@@ -195,7 +187,7 @@ class SceneModel:
 
     def echoes(
         self, sonar_m: FloatArray, aspect_rad: float, grid: GroundGrid
-    ) -> tuple[FloatArray, NDArray[np.complex128]]:
+    ) -> tuple[FloatArray, ComplexArray]:
         """Return where a sonar sees echoes, and how strong.
 
         Parameters
@@ -226,7 +218,7 @@ class SceneModel:
         inside = (u > m) & (u < grid.cols - 1 - m) & (v > m) & (v < grid.rows - 1 - m)
         return np.column_stack([u, v])[inside], amplitude[inside]
 
-    def _visible(self, sonar_m: FloatArray) -> tuple[FloatArray, NDArray[np.complex128]]:
+    def _visible(self, sonar_m: FloatArray) -> tuple[FloatArray, ComplexArray]:
         if not len(self._points):
             return self._points, self._amplitudes
         ray = sonar_m - self._points

@@ -52,8 +52,23 @@ class Scene:
     heading_rad: float
 
 
+def _turn(angle_rad: float, axis: Sequence[float] = (0.0, 0.0, 1.0)) -> FloatArray:
+    """Return the 4×4 rotation about an axis."""
+    return np.asarray(trimesh.transformations.rotation_matrix(angle_rad, axis))  # type: ignore[no-untyped-call]
+
+
+def join_bodies(bodies: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Return one mesh of several bodies, none merged with another."""
+    faces, vertices, first = [], [], 0
+    for body in bodies:
+        vertices.append(body.vertices)
+        faces.append(body.faces + first)
+        first += len(body.vertices)
+    return trimesh.Trimesh(vertices=np.concatenate(vertices), faces=np.concatenate(faces), process=False)
+
+
 def _block(size: Sequence[float], centre_xy: Sequence[float], z_min: float = 0.0) -> trimesh.Trimesh:
-    mesh = trimesh.creation.box(extents=size)
+    mesh: trimesh.Trimesh = trimesh.creation.box(extents=size)
     mesh.apply_translation([centre_xy[0], centre_xy[1], z_min + size[2] / 2.0])
     return mesh
 
@@ -70,8 +85,9 @@ def box(length_m: float = 0.8, width_m: float = 0.4, height_m: float = 0.4) -> t
 
 def cylinder(length_m: float = 1.8, diameter_m: float = 0.52) -> trimesh.Trimesh:
     """Make a cylinder that lies along x."""
-    mesh = trimesh.creation.cylinder(radius=diameter_m / 2.0, height=length_m, sections=64)
-    mesh.apply_transform(trimesh.transformations.rotation_matrix(math.pi / 2.0, [0, 1, 0]))
+    radius = diameter_m / 2.0
+    mesh: trimesh.Trimesh = trimesh.creation.cylinder(radius=radius, height=length_m, sections=64)
+    mesh.apply_transform(_turn(math.pi / 2.0, (0.0, 1.0, 0.0)))
     mesh.apply_translation([0.0, 0.0, -mesh.bounds[0, 2]])
     return mesh
 
@@ -106,9 +122,8 @@ def sphere(diameter_m: float = 0.8, buried_m: float = 0.04) -> trimesh.Trimesh:
 def tyre(outer_diameter_m: float = 0.7, height_m: float = 0.2) -> trimesh.Trimesh:
     """Make a ring that lies flat, its hole open."""
     minor = height_m / 2.0
-    mesh = trimesh.creation.torus(
-        outer_diameter_m / 2.0 - minor, minor, major_sections=64, minor_sections=24
-    )
+    major = outer_diameter_m / 2.0 - minor
+    mesh: trimesh.Trimesh = trimesh.creation.torus(major, minor, major_sections=64, minor_sections=24)
     mesh.apply_translation([0.0, 0.0, -mesh.bounds[0, 2]])
     return mesh
 
@@ -120,7 +135,7 @@ def l_shape(
     but the horizontal one."""
     long_limb = _block((length_m, limb_m, height_m), (0.0, -(width_m - limb_m) / 2.0))
     short = _block((limb_m, width_m - limb_m, height_m), (-(length_m - limb_m) / 2.0, limb_m / 2.0))
-    return trimesh.util.concatenate([long_limb, short])
+    return join_bodies([long_limb, short])
 
 
 def frame(
@@ -149,7 +164,7 @@ def frame(
     side = (part_m[1] - arm_m) / 2.0
     bodies = [_block(part_m, (s * shift, 0.0)) for s in (-1, 1)]
     bodies += [_block((gap, arm_m, arm_m), (0.0, s * side), arm_height_m - arm_m / 2.0) for s in (-1, 1)]
-    return trimesh.util.concatenate(bodies)
+    return join_bodies(bodies)
 
 
 def rock(seed: int = 0, size_m: tuple[float, float, float] = (0.7, 0.5, 0.35)) -> trimesh.Trimesh:
@@ -181,11 +196,11 @@ def laying_grid(seed: int = 0, side_m: float = 3.0) -> trimesh.Trimesh:
         # Five blocks a side from one corner on, so that the next side begins where this one ends.
         for along in np.linspace(-half + 0.15, half - 0.45, 5):
             mesh = trimesh.creation.box(extents=(0.5, 0.2, 0.1))
-            mesh.apply_transform(trimesh.transformations.rotation_matrix(rng.normal(0, 0.03), [0, 0, 1]))
+            mesh.apply_transform(_turn(rng.normal(0, 0.03)))
             mesh.apply_translation([along + rng.normal(0, 0.01), half + rng.normal(0, 0.01), 0.05])
-            mesh.apply_transform(trimesh.transformations.rotation_matrix(angle, [0, 0, 1]))
+            mesh.apply_transform(_turn(angle))
             bodies.append(mesh)
-    return trimesh.util.concatenate(bodies)
+    return join_bodies(bodies)
 
 
 def _cable(start: Sequence[float], stop: Sequence[float], sag_m: float, height_m: float = 0.01) -> FloatArray:
@@ -216,15 +231,15 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
 def _rest_on_seabed(mesh: Any, name: str) -> trimesh.Trimesh:
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise GeometryError(f"mesh {name} has no faces; expected a closed surface")
-    mesh = mesh.copy()
-    if not mesh.is_watertight:
-        mesh.merge_vertices()
-    if not mesh.is_watertight:
+    closed: trimesh.Trimesh = mesh.copy()
+    if not closed.is_watertight:
+        closed.merge_vertices()  # formats such as STL repeat the corners for each triangle
+    if not closed.is_watertight:
         raise GeometryError(f"mesh {name} is not closed; expected a watertight surface")
-    trimesh.repair.fix_normals(mesh, multibody=True)
-    low, high = mesh.bounds
-    mesh.apply_translation([-(low[0] + high[0]) / 2.0, -(low[1] + high[1]) / 2.0, -low[2]])
-    return mesh
+    trimesh.repair.fix_normals(closed, multibody=True)  # type: ignore[no-untyped-call]
+    low, high = closed.bounds
+    closed.apply_translation([-(low[0] + high[0]) / 2.0, -(low[1] + high[1]) / 2.0, -low[2]])
+    return closed
 
 
 TARGETS: dict[str, Callable[[], trimesh.Trimesh]] = {
@@ -268,7 +283,8 @@ def make_scene(
     GeometryError
         If a mesh cannot be read, has no faces or is not closed.
     """
-    decor, cables = empty_mesh(), ()
+    decor = empty_mesh()
+    cables: tuple[FloatArray, ...] = ()
     if isinstance(target, trimesh.Trimesh):
         name, mesh = "mesh", _rest_on_seabed(target, "given")
     elif Path(target).suffix.lower() in MESH_SUFFIXES:
@@ -290,7 +306,7 @@ def make_scene(
         )
     dims = tuple(float(s) for s in mesh.extents) if len(mesh.faces) else (0.0, 0.0, 0.0)
     heading = math.radians(heading_deg)
-    pose = trimesh.transformations.rotation_matrix(heading, [0, 0, 1])
+    pose = _turn(heading)
     pose[:2, 3] = position_m
     for body in (mesh, decor):
         if len(body.faces):
