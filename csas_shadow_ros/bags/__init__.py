@@ -1,16 +1,20 @@
 """Bags: reading and writing runs as rosbag2 directories, and checking them. No ROS needed."""
 
 from .bag import BagMessage, BagReader, BagWriter, TopicInfo, copy, qos_profile
+from .check import CheckReport, Finding, check_bag
 from .run import MessagePair, Problem, Run, iterate_pairs, read_run, write_run
 
 __all__ = [
     "BagMessage",
     "BagReader",
     "BagWriter",
+    "CheckReport",
+    "Finding",
     "MessagePair",
     "Problem",
     "Run",
     "TopicInfo",
+    "check_bag",
     "copy",
     "iterate_pairs",
     "qos_profile",

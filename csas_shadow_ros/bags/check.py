@@ -1,0 +1,449 @@
+"""Say whether a bag can be processed; and if not, what is wrong with it and what to do about it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.fft
+
+from csas_shadow_ros.core.errors import BagError, CsasError
+from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, Track, View
+from csas_shadow_ros.core.sector import Sector
+from msg_adapters.pairs import (
+    coherent_image_from_msgs,
+    ground_picture_from_msgs,
+    sector_from_msgs,
+    view_from_msgs,
+    voxel_grid_from_msgs,
+)
+from msg_adapters.topics import STREAMS, TOPICS, VIEW_STREAMS, absolute_name
+from msg_adapters.track import track_from_msg
+
+from .bag import BagReader
+from .run import Problem, checked_messages, iterate_pairs
+
+ERROR, WARNING, INFO = "error", "warning", "info"
+
+#: Band edges are widened by this much before energy is counted inside them.
+BAND_MARGIN = 0.1
+#: Less of an image's energy inside its stated band than this contradicts the band.
+MIN_BAND_ENERGY = 0.5
+#: Less than this is worth a word.
+GOOD_BAND_ENERGY = 0.8
+#: A view's sonar may be this fraction of its range away from the track at the view's stamp.
+SONAR_TOLERANCE = 0.02
+_MAX_FFT_SIDE = 2048
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing worth knowing about a bag.
+
+    Parameters
+    ----------
+    level : str
+        ``error``: the bag does not honour the contract; ``warning``: it can be processed, with a
+        loss; ``info``.
+    topic : str
+        Absolute name; empty if it concerns the bag itself.
+    number : int or None
+        Which message of that topic, from 0.
+    stamp_ns : int or None
+        The message's stamp.
+    problem : str
+        What is wrong.
+    remedy : str
+        What to do about it.
+    """
+
+    level: str
+    topic: str
+    number: int | None
+    stamp_ns: int | None
+    problem: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        text = f"{self.level}: {Problem(self.topic, self.number, self.stamp_ns, self.problem)}"
+        return f"{text}\n    {self.remedy}" if self.remedy else text
+
+
+@dataclass
+class CheckReport:
+    """What `check_bag` found.
+
+    Parameters
+    ----------
+    path : str
+        The bag.
+    namespace : str
+        Namespace of its topics.
+    topics : dict
+        Number of messages by topic.
+    usable : dict
+        Number of messages (pairs, for images) by stream that honour the contract.
+    findings : list of Finding
+        Errors first.
+    """
+
+    path: str
+    namespace: str = ""
+    topics: dict[str, int] = field(default_factory=dict)
+    usable: dict[str, int] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is no error."""
+        return not any(f.level == ERROR for f in self.findings)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return dataclasses.asdict(self) | {"ok": self.ok}
+
+    def to_json(self) -> str:
+        """Return the report as JSON text."""
+        return json.dumps(self.as_dict(), indent=2, allow_nan=False)
+
+    def __str__(self) -> str:
+        head = f"{self.path}: {'usable' if self.ok else 'not usable as it is'}"
+        counts = [f"  {topic}: {n}" for topic, n in sorted(self.topics.items())]
+        return "\n".join([head, *counts, *(str(f) for f in self.findings)])
+
+
+def check_bag(path: str | Path, namespace: str | None = None) -> CheckReport:
+    """Read a whole bag and report everything that breaks the contract or contradicts itself.
+
+    Parameters
+    ----------
+    path : path-like
+        A rosbag2 directory or a lone storage file.
+    namespace : str, optional
+        Namespace of its topics; found by itself if not given.
+
+    Returns
+    -------
+    CheckReport
+        Never raises for a bad bag: that is what the report is for.
+    """
+    report = CheckReport(str(path))
+    try:
+        reader = BagReader(path, namespace)
+    except BagError as error:
+        report.findings.append(
+            Finding(ERROR, "", None, None, str(error), "Name a rosbag2 directory, an .mcap or a .db3 file.")
+        )
+        return report
+    _Check(reader, report).run()
+    report.findings.sort(key=lambda f: (ERROR, WARNING, INFO).index(f.level))
+    return report
+
+
+class _Check:
+    def __init__(self, reader: BagReader, report: CheckReport) -> None:
+        self.reader = reader
+        self.report = report
+        self.track: Track | None = None
+
+    def say(self, level: str, topic: str, problem: str, remedy: str = "", **place: int | None) -> None:
+        finding = Finding(level, topic, place.get("number"), place.get("stamp_ns"), problem, remedy)
+        if finding not in self.report.findings:
+            self.report.findings.append(finding)
+
+    def problem(self, problem: Problem) -> None:
+        """Turn what reading refused into a finding with a remedy."""
+        relative = problem.topic.removeprefix(f"{self.reader.namespace}/")
+        topic = TOPICS.get(relative)
+        if problem.number is None:
+            remedy = f"Publish {problem.topic} as {topic.type_name}." if topic else ""
+        elif "of the same stamp" in problem.reason and "has no" in problem.reason:
+            remedy = "Give an image and its camera_info the very same header.stamp, and record both topics."
+        elif "differs from an earlier" in problem.reason:
+            remedy = "The stamp identifies a view: give every view a stamp of its own."
+        else:
+            remedy = f"Let the publisher of {problem.topic} send what is expected (see the topic contract)."
+        self.say(
+            ERROR, problem.topic, problem.reason, remedy, number=problem.number, stamp_ns=problem.stamp_ns
+        )
+
+    def name(self, relative: str) -> str:
+        return absolute_name(relative, self.reader.namespace)
+
+    def run(self) -> None:
+        reader, report = self.reader, self.report
+        report.namespace = reader.namespace
+        report.topics = {name: info.count for name, info in reader.topics.items()}
+        if reader.message_count == 0:
+            self.say(
+                ERROR, "", "the bag holds no messages", "Record it while the topics are being published."
+            )
+        self.find_track()
+        for stream_name in STREAMS:
+            self.check_stream(stream_name)
+        self.check_start()
+        for line in reader.problems:
+            self.say(
+                ERROR,
+                "",
+                line,
+                "Copy or record the bag again. Processed as it is, what could be read is used.",
+            )
+        if not reader.has_checksums and reader.message_count:
+            self.say(INFO, "", "parts of the bag carry no checksum: changed bits would go unnoticed")
+        known = {absolute_name(t, reader.namespace) for t in TOPICS}
+        if others := sorted(set(reader.topics) - known):
+            self.say(INFO, "", f"{len(others)} topics are not part of the contract: {', '.join(others[:8])}")
+
+    def find_track(self) -> None:
+        topic = self.name("track")
+        for message, path, stamp in checked_messages(self.reader, "track", self.problem):
+            try:
+                track = track_from_msg(path)
+            except CsasError as error:
+                self.problem(Problem(topic, message.number, stamp, str(error)))
+                continue
+            if self.track is None or len(track) >= len(self.track):
+                self.track = track
+        if self.track is None:
+            return
+        self.report.usable["track"] = len(self.track)
+        if gaps := self.track.gaps:
+            arcs = ", ".join(str(g) for g in gaps[:8])
+            arcs += f" and {len(gaps) - 8} more" if len(gaps) > 8 else ""
+            covered = math.degrees(self.track.coverage_rad)
+            self.say(
+                WARNING,
+                topic,
+                f"the track covers {covered:.1f} of 360 degrees; missing: {arcs}",
+                "No views are made in these arcs. Record the track round the whole circle if it was flown.",
+            )
+
+    def check_stream(self, stream_name: str) -> None:
+        usable = 0
+        for pair in iterate_pairs(self.reader, stream_name, self.problem):
+            try:
+                item = _read(stream_name, pair.image, pair.info)
+            except CsasError as error:
+                self.problem(Problem(pair.topic, pair.number, pair.stamp_ns, str(error)))
+                continue
+            usable += 1
+            place = {"number": pair.number, "stamp_ns": pair.stamp_ns}
+            for level, problem, remedy in self.judge(item):
+                self.say(level, pair.topic, problem, remedy, **place)
+        if usable:
+            self.report.usable[stream_name] = usable
+
+    def judge(self, item: Any) -> Iterator[tuple[str, str, str]]:
+        if self.track is None:
+            return
+        if isinstance(item, CoherentImage):
+            yield from judge_geometry(item.grid, self.track)
+            yield from judge_band(item.grid, item.acoustics, self.track)
+            yield from judge_energy(item, self.track)
+            yield from check_spectrum_sign(item, self.track)
+        elif isinstance(item, Sector):
+            yield from judge_geometry(item.grid, self.track)
+            yield from judge_band(item.grid, item.acoustics, self.track)
+        elif isinstance(item, View):
+            yield from judge_view(item, self.track)
+
+    def check_start(self) -> None:
+        usable = self.report.usable
+        images = [s for s in ("image", "sector") if usable.get(s)]
+        views = [s for s in VIEW_STREAMS if usable.get(s)]
+        if images and "track" in usable:
+            self.say(INFO, "", f"processing can start from {images[0]} and track")
+        elif views:
+            self.say(INFO, "", f"processing can start from {views[0]} ({usable[views[0]]} views)")
+        elif images:
+            self.say(
+                ERROR,
+                self.name("track"),
+                "there is an image but no usable track",
+                f"Record {self.name('track')} (nav_msgs/Path) with the image: it places the shadows.",
+            )
+        else:
+            wanted = ", ".join(self.name(s) for s in ("image", "camera_info", "track"))
+            self.say(
+                ERROR,
+                "",
+                "there is nothing to start from: no usable image, sectors or views",
+                f"Record {wanted}; or sectors and the track; or a later stage's image and camera_info.",
+            )
+
+
+def _read(stream_name: str, image: Any, info: Any) -> Any:
+    if stream_name == "image":
+        return coherent_image_from_msgs(image, info)
+    if stream_name == "sector":
+        return sector_from_msgs(image, info)
+    if stream_name == "voxel_grid":
+        return voxel_grid_from_msgs(image, info)
+    if stream_name in VIEW_STREAMS:
+        return view_from_msgs(image, info, stream_name)
+    return ground_picture_from_msgs(image, info, stream_name)
+
+
+def judge_geometry(grid: GroundGrid, track: Track) -> Iterator[tuple[str, str, str]]:
+    """Yield (level, problem, remedy) if the track does not go round the image."""
+    left, right, bottom, top = grid.extent_m
+    x, y = track.positions_m[:, 0], track.positions_m[:, 1]
+    over = (left <= x) & (x <= right) & (bottom <= y) & (y <= top)
+    if over.any():
+        i = int(over.argmax())
+        yield (
+            ERROR,
+            f"track pose {i} at ({x[i]:.2f}, {y[i]:.2f}) m is over the image, which covers x = {left:.2f} to"
+            f" {right:.2f} m and y = {bottom:.2f} to {top:.2f} m",
+            "Track and image must share one frame, csas_scene, in metres: check both origins and units.",
+        )
+        return
+    centre_x, centre_y, radius, _ = track.circle
+    middle = grid.centre_m
+    off = math.hypot(middle[0] - centre_x, middle[1] - centre_y)
+    if math.degrees(track.coverage_rad) > 300 and off > radius:
+        yield (
+            ERROR,
+            f"the image's middle is {off:.1f} m from the centre of the track's circle (radius {radius:.1f})",
+            "The track must go round the image: check that both are in csas_scene.",
+        )
+
+
+def judge_band(grid: GroundGrid, acoustics: Acoustics, track: Track) -> Iterator[tuple[str, str, str]]:
+    """Yield (level, problem, remedy) if the stated band does not fit the pixel spacing."""
+    low, _, high = acoustics.ground_band(track.grazing_rad)
+    nyquist = math.pi / grid.spacing_m
+    if high > nyquist * (1 + BAND_MARGIN):
+        yield (
+            ERROR,
+            f"the stated band reaches K = {high:.1f} rad/m, but pixels of {grid.spacing_m:g} m hold only"
+            f" {nyquist:.1f}",
+            "The image is too coarse for its band, or a frequency, the sound speed or the pixel spacing in"
+            f" camera_info is wrong (band K {low:.1f} to {high:.1f} rad/m at"
+            f" {math.degrees(track.grazing_rad):.1f} degrees grazing).",
+        )
+    elif high > nyquist:
+        yield (
+            WARNING,
+            f"the stated band's edge, K = {high:.1f} rad/m, is just beyond what pixels of"
+            f" {grid.spacing_m:g} m hold ({nyquist:.1f})",
+            "Image on slightly finer pixels, or the edge of the spectrum folds over.",
+        )
+
+
+@dataclass(frozen=True)
+class BandEnergy:
+    """Where an image's energy lies.
+
+    Parameters
+    ----------
+    fraction : float
+        Share of the energy inside the stated band, widened by `BAND_MARGIN`.
+    low_rad_m, high_rad_m : float
+        Wavenumbers between which the middle 90 % of the energy lies.
+    """
+
+    fraction: float
+    low_rad_m: float
+    high_rad_m: float
+
+
+def band_energy(image: CoherentImage, grazing_rad: float) -> BandEnergy:
+    """Measure how much of an image's energy lies inside its stated wavenumber band.
+
+    Parameters
+    ----------
+    image : CoherentImage
+        The image; of a large one the middle is taken.
+    grazing_rad : float
+        Mean grazing angle, which turns frequencies into ground wavenumbers.
+    """
+    rows, cols = (min(n, _MAX_FFT_SIDE) for n in image.grid.shape)
+    r, c = (image.grid.rows - rows) // 2, (image.grid.cols - cols) // 2
+    tile = image.pixels[r : r + rows, c : c + cols]
+    spectrum = scipy.fft.fft2(tile)
+    power = spectrum.real.astype(np.float64) ** 2 + spectrum.imag.astype(np.float64) ** 2
+    d = image.grid.spacing_m
+    k_row = 2 * np.pi * scipy.fft.fftfreq(rows, d)
+    k_col = 2 * np.pi * scipy.fft.fftfreq(cols, d)
+    bins = 512
+    edge = math.sqrt(2) * math.pi / d
+    index = np.minimum((np.hypot(k_row[:, None], k_col[None, :]) * (bins / edge)).astype(np.int64), bins - 1)
+    radial = np.bincount(index.ravel(), weights=power.ravel(), minlength=bins)
+    share = np.cumsum(radial) / radial.sum()
+    k = (np.arange(bins) + 1) * edge / bins
+    low, _, high = image.acoustics.ground_band(grazing_rad)
+    inside = np.interp([low * (1 - BAND_MARGIN), high * (1 + BAND_MARGIN)], k, share, left=0.0)
+    return BandEnergy(
+        float(inside[1] - inside[0]),
+        float(k[np.searchsorted(share, 0.05)]),
+        float(k[np.searchsorted(share, 0.95)]),
+    )
+
+
+def judge_energy(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, str]]:
+    """Yield (level, problem, remedy) if the image's energy lies outside its stated band."""
+    energy = band_energy(image, track.grazing_rad)
+    if energy.fraction >= GOOD_BAND_ENERGY:
+        return
+    low, _, high = image.acoustics.ground_band(track.grazing_rad)
+    to_hz = image.acoustics.sound_speed_mps / (4 * math.pi * math.cos(track.grazing_rad))
+    yield (
+        ERROR if energy.fraction < MIN_BAND_ENERGY else WARNING,
+        f"{100 * energy.fraction:.0f} % of the image's energy lies in its stated band, K {low:.1f} to"
+        f" {high:.1f} rad/m; 90 % of it lies at K {energy.low_rad_m:.1f} to {energy.high_rad_m:.1f} rad/m",
+        f"With the stated sound speed that is {energy.low_rad_m * to_hz:.0f} to"
+        f" {energy.high_rad_m * to_hz:.0f} Hz: check centre frequency, bandwidth and sound speed"
+        " (camera_info.d[0:3]), the pixel spacing (p), and that the image is not at baseband.",
+    )
+
+
+def judge_view(view: View, track: Track) -> Iterator[tuple[str, str, str]]:
+    """Yield (level, problem, remedy) if a view's sonar is not where the track says."""
+    stamps = track.stamps_ns - track.stamps_ns[0]
+    when = view.info.stamp_ns - int(track.stamps_ns[0])
+    step = int(np.median(np.diff(track.stamps_ns)))
+    if not -step <= when <= int(stamps[-1]) + step:
+        yield (
+            WARNING,
+            "the view's stamp is outside the track's time",
+            "Stamp a view with the time when the sonar was at its aspect.",
+        )
+        return
+    expected = np.array([np.interp(when, stamps, track.positions_m[:, i]) for i in range(3)])
+    sonar = view.info.camera.sonar_m
+    off = float(np.linalg.norm(sonar - expected))
+    if off > SONAR_TOLERANCE * float(np.linalg.norm(expected)):
+        yield (
+            WARNING,
+            f"its camera_info puts the sonar at {np.round(sonar, 2).tolist()} m, {off:.2f} m from the track"
+            f" at that stamp ({np.round(expected, 2).tolist()} m)",
+            "Make camera_info.p from the sonar's true position at the view's stamp.",
+        )
+
+
+def check_spectrum_sign(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, str]]:
+    """Yield (level, problem, remedy) if the image contradicts its stated spectrum sign."""
+    # Imported here: a bag of views is checked without the weight of the whole method.
+    from csas_shadow_ros.core.target import spectrum_sign_evidence
+
+    try:
+        evidence, _ = spectrum_sign_evidence(image, track)
+    except CsasError as error:
+        yield WARNING, f"the spectrum sign cannot be checked: {error}", ""
+        return
+    if evidence.verdict == "wrong":
+        yield (
+            ERROR,
+            str(evidence),
+            f"Set spectrum_sign (camera_info.d[3]) to {-evidence.stated:+d}.",
+        )
+    else:
+        yield INFO, str(evidence), ""
