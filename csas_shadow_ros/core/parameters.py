@@ -162,6 +162,10 @@ class CarvingParameters(Parameters):
         0.25, "a voxel seen by a smaller fraction of the views is unknown", low=0.0, high=1.0
     )
 
+    def other(self) -> CarvingParameters:
+        """Return the same parameters for the other method, with its automatic threshold."""
+        return dataclasses.replace(self, method="hard" if self.method == "soft" else "soft", threshold=0.0)
+
 
 @dataclass(frozen=True)
 class TargetParameters(Parameters):

@@ -20,8 +20,10 @@ from .geometry import View
 from .likelihood import Levels, box_mean, echo_mask, view_levels
 from .parameters import LikelihoodParameters
 
-#: Shadow seeds are looked for this many metres of down-range behind the target's focus, times its size.
+#: Smaller dark patches are speckle.
 _MIN_SHADOW_PIXELS = 25
+#: Patches of at least this fraction of the largest are shadows of the target's outline.
+_LARGE_PATCH = 0.3
 
 
 def dark_pixels(
@@ -92,7 +94,7 @@ def segment_shadow(
     shadow = _of_target(cleaned, view, target_m, reach_m)
     mask = np.full(known.shape, MASK_OUTSIDE, np.uint8)
     mask[shadow] = MASK_SHADOW
-    mask[(echo | _before_shadow(shadow, view)) & ~shadow] = MASK_UNKNOWN
+    mask[(echo | _before_shadow(shadow)) & ~shadow] = MASK_UNKNOWN
     mask[~known] = MASK_UNKNOWN
     return replace(view, pixels=mask)
 
@@ -119,19 +121,27 @@ def _of_target(
     return keep[labels]
 
 
-def _before_shadow(shadow: NDArray[np.bool_], view: View) -> NDArray[np.bool_]:
-    """Mark the pixels up-range of the first shadow pixel of each column that a target may cover.
+def _before_shadow(shadow: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mark the pixels up-range of the target's shadow that the target itself may cover.
 
     The shadow hides the seabed from the target's foot on; between the foot and where the view turns
     dark lies the target's own echo, bright or faint. How deep it is cannot be seen, so that all of
-    the column within the shadow's own length is left open.
+    the column within the shadow's own length is left open. Only the large patches count: a small one
+    may be a hole in the target (a tyre's), with more of its echo behind.
     """
-    any_shadow = shadow.any(axis=0)
-    first = shadow.argmax(axis=0)
-    last = shadow.shape[0] - 1 - shadow[::-1].argmax(axis=0)
-    depth = np.where(any_shadow, np.minimum(last - first + 1, first), 0)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(shadow.astype(np.uint8), connectivity=8)
+    unknown = np.zeros(shadow.shape, bool)
+    if count < 2:
+        return unknown
+    areas = stats[1:, cv2.CC_STAT_AREA]
     rows = np.arange(shadow.shape[0])[:, None]
-    return np.asarray(any_shadow & (rows < first) & (rows >= first - depth))
+    for label in np.flatnonzero(areas >= _LARGE_PATCH * areas.max()) + 1:
+        patch = labels == label
+        first = patch.argmax(axis=0)
+        last = shadow.shape[0] - 1 - patch[::-1].argmax(axis=0)
+        depth = np.where(patch.any(axis=0), np.minimum(last - first + 1, first), 0)
+        unknown |= (rows < first) & (rows >= first - depth)
+    return unknown
 
 
 def silhouette_found(mask: View) -> bool:

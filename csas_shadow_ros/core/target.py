@@ -63,6 +63,11 @@ class Target:
     size_m: tuple[float, float, float]
     evidence: float = math.nan
 
+    @property
+    def reach_m(self) -> float:
+        """Distance from the middle within which the target's own shadows begin (margin excluded)."""
+        return 0.5 * math.hypot(self.size_m[0], self.size_m[1]) / (1.0 + 2.0 * _MARGIN_SHARE)
+
 
 @dataclass(frozen=True, eq=False)
 class Search:

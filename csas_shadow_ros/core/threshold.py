@@ -1,6 +1,93 @@
-"""From mean likelihoods to the object's voxels."""
+"""From likelihoods to the object's voxels: the threshold, the support and the clean-up."""
+
 from __future__ import annotations
+
+import math
+
 import numpy as np
-def object_threshold(likelihood, method): return 0.2
-def occupied_voxels(likelihood, threshold):
-    with np.errstate(invalid="ignore"): return likelihood<threshold
+import scipy.ndimage
+from numpy.typing import NDArray
+
+#: Where the threshold lies between the darkest voxels (0) and the brightest (1) of the volume. A voxel
+#: outside the object is bright in some views only: those that look past the object's side.
+_LEVEL = {"soft": 0.115, "hard": 0.04}
+#: A voxel under the object is part of it unless this many times the threshold contradicts.
+_SUPPORT_RATIO = 3.2
+#: No object: the darkest voxels are brighter than this fraction of the brightest.
+_NO_OBJECT = 0.5
+#: How many voxels "the darkest" are.
+_DARKEST = 27
+#: Pieces of less than this fraction of the largest piece are noise.
+_PIECE = 0.05
+
+
+def object_threshold(likelihood: NDArray[np.float32], method: str) -> float:
+    """Choose the threshold from the distribution of the voxels' likelihood (section 4.2).
+
+    Parameters
+    ----------
+    likelihood : ndarray of float32
+        Mean l_out (or fraction of views that removed the voxel); NaN unknown.
+    method : {'soft', 'hard'}
+        How it was carved.
+
+    Returns
+    -------
+    float
+        Threshold; NaN where no voxel is much darker than the rest: there is no object.
+    """
+    known = likelihood[np.isfinite(likelihood)]
+    if known.size < 2 * _DARKEST:
+        return math.nan
+    dark = float(np.partition(known, _DARKEST)[:_DARKEST].mean())
+    bright = float(np.percentile(known, 99.0))
+    if bright <= 0.0 or dark > _NO_OBJECT * bright:
+        return math.nan
+    return dark + _LEVEL[method] * (bright - dark)
+
+
+def supported(dark: NDArray[np.bool_], likelihood: NDArray[np.float32], limit: float) -> NDArray[np.bool_]:
+    """Extend dark voxels downwards, as objects rest on the seabed.
+
+    The target's own echo lies over the pixels where its lowest voxels would cast their shadow, so that these
+    look lit or unknown. A voxel below one of the object belongs to it unless its likelihood is over
+    `limit`: under an overhang the seabed is seen lit, and the gap stays.
+
+    Parameters
+    ----------
+    dark : ndarray of bool, shape (nz, ny, nx)
+        Voxels under the threshold.
+    likelihood : ndarray of float32, shape (nz, ny, nx)
+        NaN unknown.
+    limit : float
+        Likelihood that contradicts.
+    """
+    out = dark.copy()
+    with np.errstate(invalid="ignore"):
+        open_to = ~(likelihood >= limit)
+    for k in range(out.shape[0] - 2, -1, -1):
+        out[k] |= out[k + 1] & open_to[k]
+    return out
+
+
+def occupied_voxels(likelihood: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
+    """Return the object's voxels: under the threshold, supported, without stray pieces.
+
+    Parameters
+    ----------
+    likelihood : ndarray of float32, shape (nz, ny, nx)
+        NaN unknown: never object by itself.
+    threshold : float
+        NaN for no object.
+    """
+    if math.isnan(threshold):
+        return np.zeros(likelihood.shape, bool)
+    with np.errstate(invalid="ignore"):
+        dark = likelihood < threshold
+    body = supported(dark, likelihood, min(_SUPPORT_RATIO * threshold, 1.0))
+    labels, count = scipy.ndimage.label(body, np.ones((3, 3, 3), bool))
+    if count < 2:
+        return body
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return np.asarray((sizes >= _PIECE * sizes.max())[labels] & body)

@@ -1,0 +1,221 @@
+"""The whole method: a circular run in, a 3-D shape out.
+
+Read this first. Each line of `process_view` is a section of the paper, and the module it calls holds
+the equations. The node graph calls the same functions and leaves the same grid.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import trimesh
+
+from .carving import Carver
+from .composites import Composites
+from .errors import ViewError
+from .geometry import CoherentImage, Track, View
+from .likelihood import Levels, outside_likelihood, view_levels
+from .mesh import Dimensions, measure, mesh_from_grid
+from .parameters import CarvingParameters, PipelineParameters
+from .segmentation import require_silhouette, segment_shadow
+from .shadow import enhance
+from .subaperture import Spectrum, SubApertures
+from .target import SignEvidence, Target, choose_target, find_target, spectrum_sign_evidence
+from .volume import Volume, VoxelGrid
+
+
+@dataclass(frozen=True, eq=False)
+class ProcessedView:
+    """One view through all stages."""
+
+    sub_aperture: View
+    shadow: View
+    levels: Levels
+    likelihood: View
+    mask: View
+
+
+@dataclass(eq=False)
+class Result:
+    """What a run leaves.
+
+    Attributes
+    ----------
+    target : Target or None
+        The volume that was carved; None: there is no object.
+    sign : SignEvidence or None
+        Whether the shadows fit the spectrum sign; None if it was not checked.
+    grid, other_grid : VoxelGrid or None
+        By the chosen method, and by the other one.
+    mesh, dimensions : trimesh.Trimesh, Dimensions or None
+        Surface and measures of the object.
+    composites : Composites
+        Multi-look and colour-by-aspect images.
+    views_used : int
+        Views in the grid.
+    rejected : dict
+        Reason for each aspect (degrees) whose view was not used.
+    levels : dict
+        (σ_r, contrast, estimated) of each view, by stamp.
+    timings_s : dict
+        Seconds of wall time by step.
+    """
+
+    target: Target | None = None
+    sign: SignEvidence | None = None
+    grid: VoxelGrid | None = None
+    other_grid: VoxelGrid | None = None
+    mesh: trimesh.Trimesh | None = None
+    dimensions: Dimensions | None = None
+    composites: Composites | None = None
+    views_used: int = 0
+    rejected: dict[float, str] = field(default_factory=dict)
+    levels: dict[int, tuple[float, float, bool]] = field(default_factory=dict)
+    timings_s: dict[str, float] = field(default_factory=dict)
+
+
+def process_view(sub_apertures: SubApertures, aspect_rad: float, target: Target, p: PipelineParameters) -> ProcessedView:
+    """Take one aspect through every stage of the paper."""
+    sub_aperture = sub_apertures.view_of_aspect(aspect_rad)  # 3.1 spectral masking
+    shadow = enhance(sub_aperture, target.position_m, p.shadow)  # 3.2 fixed focus shadow enhancement
+    levels = view_levels(shadow, p.likelihood)  # 4.2 σ_r and σ_s
+    likelihood = outside_likelihood(shadow, p.likelihood, levels)  # 4.2 l_out
+    mask = segment_shadow(shadow, target.position_m, p.likelihood, levels, reach_m=target.reach_m)  # 4.1 silhouette
+    return ProcessedView(sub_aperture, shadow, levels, likelihood, mask)
+
+
+def run(
+    image: CoherentImage,
+    track: Track,
+    parameters: PipelineParameters | None = None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+    on_view: Callable[[ProcessedView], None] | None = None,
+    workers: int = 2,
+) -> Result:
+    """Reconstruct the target of a circular run from its shadows.
+
+    Parameters
+    ----------
+    image : CoherentImage
+        Full-circle coherent image.
+    track : Track
+        Where the sonar was.
+    parameters : PipelineParameters
+        Every stage's parameters.
+    progress : callable, optional
+        Called with (views done, views in all).
+    on_view : callable, optional
+        Called with every processed view, in order of aspect, to keep or show it.
+    workers : int
+        Threads.
+
+    Returns
+    -------
+    Result
+        `result.target` is None where the scene holds no object.
+
+    Raises
+    ------
+    SpectrumSignError
+        If the shadows contradict the stated spectrum sign.
+    NoTargetError
+        If a target position was given and nothing is there.
+    """
+    p = parameters or PipelineParameters()
+    result, start = Result(), time.perf_counter()
+
+    def lap(step: str) -> None:
+        result.timings_s[step] = time.perf_counter() - start - sum(result.timings_s.values())
+
+    spectrum = Spectrum.of_image(image, workers)
+    lap("spectrum")
+    if p.sub_aperture.check_sign:
+        result.sign, search = spectrum_sign_evidence(image, track, spectrum=spectrum)
+        result.sign.check()
+        result.target = choose_target(search, p.target)
+    else:
+        result.target = find_target(image, track, p.target, spectrum=spectrum)
+    lap("target")
+    sub_apertures = SubApertures(image, track, p.sub_aperture, spectrum=spectrum)
+    target = result.target
+    carvers = _carvers(target, p.carving) if target else []
+
+    def make(aspect: float) -> ProcessedView | View | ViewError:
+        try:
+            return process_view(sub_apertures, aspect, target, p) if target else sub_apertures.view_of_aspect(aspect)
+        except ViewError as error:
+            return error
+
+    aspects = [float(a) for a in sub_apertures.aspects_rad]
+    for done, (aspect, view) in enumerate(_in_order(make, aspects, workers), start=1):
+        if isinstance(view, ViewError):
+            result.rejected[round(math.degrees(aspect), 6)] = str(view)
+        elif isinstance(view, View):
+            _compose(result, view)
+        else:
+            _compose(result, view.sub_aperture)
+            _integrate(result, carvers, view)
+            if on_view:
+                on_view(view)
+        if progress:
+            progress(done, len(aspects))
+    lap("views")
+    if carvers and result.views_used:
+        result.grid, result.other_grid = (carver.grid() for carver in carvers)
+        if result.grid.occupied.any():
+            result.mesh = mesh_from_grid(result.grid)
+            result.dimensions = measure(result.mesh)
+    lap("shape")
+    return result
+
+
+def _carvers(target: Target, parameters: CarvingParameters) -> list[Carver]:
+    """Make the chosen method's carver and the other one's, for comparison (figure 8)."""
+    volume = Volume.around(target.position_m, target.size_m, parameters.voxel_size_m)
+    return [Carver(volume, parameters), Carver(volume, parameters.other())]
+
+
+def _compose(result: Result, view: View) -> None:
+    if result.composites is None:
+        result.composites = Composites.for_view(view)
+    result.composites.integrate(view)
+
+
+def _integrate(result: Result, carvers: list[Carver], view: ProcessedView) -> None:
+    used = False
+    for carver in carvers:
+        try:
+            if carver.parameters.method == "hard":
+                integrated = carver.integrate(require_silhouette(view.mask))  # 4.1 space carving
+            else:
+                integrated = carver.integrate(view.likelihood)  # 4.2 soft carving
+        except ViewError as error:
+            if carver is carvers[0]:
+                result.rejected[round(math.degrees(view.shadow.info.aspect_rad), 6)] = str(error)
+            continue
+        used |= integrated and carver is carvers[0]
+    result.views_used += used
+    levels = view.levels
+    result.levels[view.shadow.info.stamp_ns] = (levels.seabed_level, levels.contrast, levels.estimated)
+
+
+def _in_order(
+    make: Callable[[float], ProcessedView | View | ViewError], aspects: list[float], workers: int
+) -> Iterator[tuple[float, ProcessedView | View | ViewError]]:
+    """Make the views in threads, at most a few ahead, and give them in order of aspect."""
+    waiting: deque[tuple[float, Future[ProcessedView | View | ViewError]]] = deque()
+    with ThreadPoolExecutor(workers) as pool:
+        for aspect in aspects:
+            waiting.append((aspect, pool.submit(make, aspect)))
+            if len(waiting) > 2 * workers:
+                first, future = waiting.popleft()
+                yield first, future.result()
+        while waiting:
+            first, future = waiting.popleft()
+            yield first, future.result()
