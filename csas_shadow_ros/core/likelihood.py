@@ -30,70 +30,78 @@ _MIN_CONTRAST2 = 10.0**0.4
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Seabed and shadow level of one view.
+    """Seabed and shadow level of one view, and the view relative to them.
 
     Parameters
     ----------
-    seabed : ndarray of float32, shape (rows, cols)
-        σ_r at every pixel.
+    seabed_level : float
+        Median of σ_r over the view.
     contrast : float
         σ_r / σ_s.
     shadow_fraction : float
         Fraction of the known pixels inside shadows; NaN if it was not measured.
     estimated : bool
         Whether σ_s was measured (True) or comes from the contrast hypothesis.
+    power : ndarray of float32, shape (rows, cols)
+        (i/σ_r)²/2, which has mean 1 on the seabed; 0 where unknown.
+    known : ndarray of bool, shape (rows, cols)
+        Pixels that the view knows.
     """
 
-    seabed: FloatImage
+    seabed_level: float
     contrast: float
     shadow_fraction: float
     estimated: bool
-
-    @property
-    def seabed_level(self) -> float:
-        """Median σ_r over the view."""
-        return float(np.median(self.seabed))
+    power: FloatImage
+    known: NDArray[np.bool_]
 
 
-def l_out(amplitude_over_seabed: NDArray[np.floating], contrast: float) -> NDArray[np.floating]:
-    """Evaluate l_out = (p_r / (p_r + p_s))² for amplitudes i/σ_r and contrast σ_r/σ_s.
+def l_out(power: FloatImage, contrast: float) -> FloatImage:
+    """Evaluate l_out = (p_r / (p_r + p_s))² for powers (i/σ_r)²/2 and contrast σ_r/σ_s.
 
     Written as (1 + (σ_r/σ_s)² exp(-(i/σ_r)²/2 · ((σ_r/σ_s)² - 1)))⁻², which is finite at i = 0 and
     cannot overflow.
 
     Parameters
     ----------
-    amplitude_over_seabed : ndarray
-        i/σ_r, not negative.
+    power : ndarray of float32
+        (i/σ_r)²/2, not negative.
     contrast : float
         σ_r/σ_s, over 1.
     """
     c2 = np.float32(contrast * contrast)
-    power = np.square(amplitude_over_seabed)
-    ratio = c2 * np.exp(power * (np.float32(-0.5) * (c2 - np.float32(1.0))))
-    return np.square(np.reciprocal(np.float32(1.0) + ratio))
+    out = power * (np.float32(1.0) - c2)
+    np.exp(out, out=out)
+    out *= c2
+    out += np.float32(1.0)
+    np.reciprocal(out, out=out)
+    np.square(out, out=out)
+    return out
 
 
 def expected_l_out(contrast: float) -> tuple[float, float]:
     """Return the mean of l_out over Rayleigh shadow pixels and over Rayleigh seabed pixels."""
-    # i² / (2σ²) is exponential: integrate over its quantiles.
-    quantiles = -np.log1p(-(np.arange(4096) + 0.5) / 4096)
-    seabed = l_out(np.sqrt(2.0 * quantiles).astype(np.float32), contrast)
-    shadow = l_out((np.sqrt(2.0 * quantiles) / contrast).astype(np.float32), contrast)
-    return float(shadow.mean()), float(seabed.mean())
+    # i²/(2σ²) is exponential: integrate over its quantiles.
+    power = -np.log1p(-(np.arange(4096) + 0.5) / 4096).astype(np.float32)
+    shadow = l_out(power / np.float32(contrast * contrast), contrast)
+    return float(shadow.mean()), float(l_out(power, contrast).mean())
 
 
 def _block_medians(
     amplitude: FloatImage, block: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Median of each block with enough known pixels, and the blocks' middles in [-1, 1]."""
+    """Median of each wholly known block, and the blocks' middles in [-1, 1]."""
     rows, cols = amplitude.shape
     n_v, n_u = max(rows // block, 1), max(cols // block, 1)
     tiles = amplitude[: n_v * block, : n_u * block]
-    tiles = tiles.reshape(n_v, min(block, rows), n_u, min(block, cols)).swapaxes(1, 2).reshape(n_v * n_u, -1)
-    enough = np.isfinite(tiles).sum(axis=1) >= tiles.shape[1] // 2
-    v, u = np.divmod(np.flatnonzero(enough), n_u)
-    medians = np.nanmedian(tiles[enough], axis=1) if enough.any() else np.empty(0)
+    tiles = tiles.reshape(n_v, min(block, rows), n_u, min(block, cols))
+    # Neighbouring pixels hold the same speckle: every other one tells as much.
+    tiles = tiles[:, ::2, :, ::2].swapaxes(1, 2).reshape(n_v * n_u, -1)
+    whole = np.flatnonzero(np.isfinite(tiles.sum(axis=1)))
+    tiles = tiles[whole]
+    middle = tiles.shape[1] // 2
+    medians = np.partition(tiles, middle, axis=1)[:, middle]
+    v, u = np.divmod(whole, n_u)
     return medians.astype(np.float64), ((v + 0.5) * block / rows) * 2 - 1, ((u + 0.5) * block / cols) * 2 - 1
 
 
@@ -145,24 +153,34 @@ def seabed_level(amplitude: FloatImage, background: str) -> FloatImage:
         normal = (design * weight[:, None]).T @ design + np.diag([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])
         right = (design * weight[:, None]).T @ log_level
         coefficients = np.linalg.solve(normal, right)
-    yy = (np.arange(rows) + 0.5) / rows * 2 - 1
-    xx = (np.arange(cols) + 0.5) / cols * 2 - 1
-    c = coefficients
-    # exp(a + b v + c u + d v² + e v u + f u²), separable but for the cross term
-    surface = (c[0] + c[1] * yy + c[3] * yy**2)[:, None] + (c[2] * xx + c[5] * xx**2)[None, :]
-    surface += c[4] * yy[:, None] * xx[None, :]
-    return (np.exp(surface) / _MEDIAN_OVER_MODE).astype(np.float32)
+    # The surface is smooth: a coarse lattice of it is interpolated.
+    yy, xx = np.linspace(-1, 1, 33), np.linspace(-1, 1, 33)
+    coarse = _surface(*np.meshgrid(yy, xx, indexing="ij")) @ coefficients
+    u = (np.arange(cols, dtype=np.float32) + 0.5) / cols * 32
+    v = (np.arange(rows, dtype=np.float32) + 0.5) / rows * 32
+    level = np.exp(coarse).astype(np.float32) / np.float32(_MEDIAN_OVER_MODE)
+    return cv2.remap(level, *np.broadcast_arrays(u[None, :], v[:, None]), cv2.INTER_LINEAR)
 
 
-def box_mean(image: FloatImage, known: NDArray[np.bool_], radius_px: tuple[int, int]) -> FloatImage:
-    """Mean over a box of known pixels only."""
+def box_mean(power: FloatImage, known: NDArray[np.bool_], radius_px: tuple[int, int]) -> FloatImage:
+    """Mean over a box of known pixels only.
+
+    Parameters
+    ----------
+    power : ndarray of float32, shape (rows, cols)
+        0 where unknown.
+    known : ndarray of bool, shape (rows, cols)
+        Pixels to count.
+    radius_px : (int, int)
+        Half-size of the box, (rows, cols).
+    """
     size = (2 * radius_px[1] + 1, 2 * radius_px[0] + 1)
-    total = cv2.boxFilter(np.where(known, image, np.float32(0)), -1, size, normalize=False)
-    weight = cv2.boxFilter(known.astype(np.float32), -1, size, normalize=False)
-    return np.asarray(total / np.maximum(weight, 1.0), dtype=np.float32)
+    total = cv2.boxFilter(power, -1, size, normalize=False)
+    weight = cv2.boxFilter(known.view(np.uint8), cv2.CV_32F, size, normalize=False)
+    return np.asarray(total / np.maximum(weight, np.float32(1.0)), dtype=np.float32)
 
 
-def fit_contrast(amplitude_over_seabed: FloatImage, start_db: float) -> tuple[float, float] | None:
+def fit_contrast(power: FloatImage, known: NDArray[np.bool_], start_db: float) -> tuple[float, float] | None:
     """Measure σ_r/σ_s on the view's own shadows.
 
     Shadows are found first, as patches of low mean power, and the level is that of their interiors:
@@ -170,8 +188,10 @@ def fit_contrast(amplitude_over_seabed: FloatImage, start_db: float) -> tuple[fl
 
     Parameters
     ----------
-    amplitude_over_seabed : ndarray of float32
-        i/σ_r; NaN where unknown.
+    power : ndarray of float32, shape (rows, cols)
+        (i/σ_r)²/2; 0 where unknown.
+    known : ndarray of bool, shape (rows, cols)
+        Pixels that the view knows.
     start_db : float
         Contrast to start from.
 
@@ -180,22 +200,21 @@ def fit_contrast(amplitude_over_seabed: FloatImage, start_db: float) -> tuple[fl
     (contrast, shadow_fraction) or None
         None where the view holds no shadow to measure: the fit is then refused rather than trusted.
     """
-    known = np.isfinite(amplitude_over_seabed)
-    power = np.square(np.nan_to_num(amplitude_over_seabed)) / np.float32(2.0)
     smooth = box_mean(power, known, (2, 2))
     contrast2 = 10.0 ** (start_db / 10.0)
-    count = 0
+    kernel = np.ones((5, 5), np.uint8)
+    count, total = 0, int(known.sum())
     for _ in range(3):
         # Halfway between the two levels in dB; patches of 5×5 looks seldom cross it by chance.
-        dark = ((smooth < contrast2**-0.5) & known).astype(np.uint8)
-        interior = cv2.erode(dark, np.ones((5, 5), np.uint8)).astype(bool)
-        count = int(interior.sum())
+        dark = ((smooth < contrast2**-0.5) & known).view(np.uint8)
+        interior = power[cv2.erode(dark, kernel).view(bool)]
+        count = interior.size
         if count < _MIN_SHADOW_PIXELS:
             return None
-        contrast2 = 1.0 / max(float(power[interior].mean()), 1e-6)
+        contrast2 = 1.0 / max(float(interior.mean()), 1e-6)
         if contrast2 < _MIN_CONTRAST2:
             return None
-    return math.sqrt(contrast2), count / int(known.sum())
+    return math.sqrt(contrast2), count / total
 
 
 def view_levels(view: View, parameters: LikelihoodParameters | None = None) -> Levels:
@@ -218,28 +237,34 @@ def view_levels(view: View, parameters: LikelihoodParameters | None = None) -> L
     if amplitude.dtype != np.float32:
         raise ViewError(f"shadow view has {amplitude.dtype} pixels; expected float32 amplitude")
     seabed = seabed_level(amplitude, p.background)
-    assumed = 10.0 ** (p.shadow_contrast_db / 20.0)
-    if p.shadow_level == "contrast":
-        return Levels(seabed, assumed, math.nan, False)
-    fit = fit_contrast(amplitude / seabed, p.shadow_contrast_db)
-    return Levels(seabed, assumed, math.nan, False) if fit is None else Levels(seabed, *fit, True)
+    power = amplitude / seabed
+    np.square(power, out=power)
+    power *= np.float32(0.5)
+    known = np.isfinite(power)
+    power[~known] = 0.0
+    contrast, fraction, estimated = 10.0 ** (p.shadow_contrast_db / 20.0), math.nan, False
+    if p.shadow_level == "estimated":
+        fit = fit_contrast(power, known, p.shadow_contrast_db)
+        if fit is not None:
+            contrast, fraction, estimated = *fit, True
+    return Levels(float(np.median(seabed[::8, ::8])), contrast, fraction, estimated, power, known)
 
 
-def echo_mask(amplitude_over_seabed: FloatImage, echo_db: float) -> NDArray[np.bool_]:
+def echo_mask(power: FloatImage, known: NDArray[np.bool_], echo_db: float) -> NDArray[np.bool_]:
     """Mark echoes: pixels whose 3×3 mean power is `echo_db` above the seabed's.
 
     Parameters
     ----------
-    amplitude_over_seabed : ndarray of float32, shape (rows, cols)
-        i/σ_r; NaN where unknown.
+    power : ndarray of float32, shape (rows, cols)
+        (i/σ_r)²/2; 0 where unknown.
+    known : ndarray of bool, shape (rows, cols)
+        Pixels that the view knows.
     echo_db : float
         Threshold over the seabed's mean power 2σ_r², dB.
     """
-    known = np.isfinite(amplitude_over_seabed)
-    power = box_mean(np.square(np.nan_to_num(amplitude_over_seabed)), known, (1, 1)) / 2.0
-    bright = (power > 10.0 ** (echo_db / 10.0)) & known
+    bright = box_mean(power, known, (1, 1)) > np.float32(10.0 ** (echo_db / 10.0))
     # One pixel more: the flank of an echo's response is neither seabed nor shadow.
-    return cv2.dilate(bright.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    return cv2.dilate((bright & known).view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
 
 
 def outside_likelihood(
@@ -269,14 +294,13 @@ def outside_likelihood(
     """
     p = parameters or LikelihoodParameters()
     levels = levels or view_levels(view, p)
-    relative = view.pixels / levels.seabed
-    echo = echo_mask(relative, p.echo_db) if p.echo_unknown else None
+    power = levels.power
     if p.smoothing_m > 0:
-        known = np.isfinite(relative)
-        radius = tuple(round(p.smoothing_m / (2.0 * s)) for s in view.info.camera.spacing_m)
-        power = box_mean(np.square(np.nan_to_num(relative)), known, (radius[0], radius[1]))
-        relative = np.where(known, np.sqrt(power), np.float32(np.nan))
-    out = l_out(relative, levels.contrast).astype(np.float32, copy=False)
-    if echo is not None:
-        out[echo] = np.nan
+        rows_m, cols_m = view.info.camera.spacing_m
+        radius = round(p.smoothing_m / (2.0 * rows_m)), round(p.smoothing_m / (2.0 * cols_m))
+        power = box_mean(power, levels.known, radius)
+    out = l_out(power, levels.contrast)
+    out[~levels.known] = np.nan
+    if p.echo_unknown:
+        out[echo_mask(levels.power, levels.known, p.echo_db)] = np.nan
     return replace(view, pixels=out)

@@ -26,26 +26,20 @@ _MIN_SHADOW_PIXELS = 25
 _LARGE_PATCH = 0.3
 
 
-def dark_pixels(
-    relative: NDArray[np.float32], contrast: float, radius_px: tuple[int, int] = (2, 2)
-) -> NDArray[np.bool_]:
-    """Mark pixels whose local mean power is nearer (in dB) to the shadow's than to the seabed's.
+def dark_pixels(levels: Levels, radius_px: tuple[int, int] = (2, 2)) -> NDArray[np.bool_]:
+    """Mark pixels whose local mean power belongs to shadow rather than to seabed.
 
     Parameters
     ----------
-    relative : ndarray of float32, shape (rows, cols)
-        i/σ_r; NaN where unknown.
-    contrast : float
-        σ_r/σ_s.
+    levels : Levels
+        The view relative to its seabed level.
     radius_px : (int, int)
         Half-size of the averaging box, (rows, cols).
     """
-    known = np.isfinite(relative)
-    power = box_mean(np.square(np.nan_to_num(relative)), known, radius_px) / 2.0
+    power = box_mean(levels.power, levels.known, radius_px)
     # At an edge, a box half on shadow has half the seabed's power: 0.5 is where the edge itself lies.
     # Speckle asks for less; the geometric mean of both levels is the floor of what makes sense.
-    level = max(0.35, 1.0 / contrast)
-    return (power < level) & known
+    return (power < max(0.35, 1.0 / levels.contrast)) & levels.known
 
 
 def segment_shadow(
@@ -84,18 +78,16 @@ def segment_shadow(
     """
     p = parameters or LikelihoodParameters()
     levels = levels or view_levels(view, p)
-    relative = view.pixels / levels.seabed
-    known = np.isfinite(relative)
-    echo = echo_mask(relative, p.echo_db) if p.echo_unknown else np.zeros(known.shape, bool)
-    dark = dark_pixels(relative, levels.contrast)
-    kernel = np.ones((3, 3), np.uint8)
-    cleaned = cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, kernel)
+    dark = dark_pixels(levels).view(np.uint8)
+    cleaned = cv2.morphologyEx(dark, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     cleaned = cv2.morphologyEx(cleaned, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     shadow = _of_target(cleaned, view, target_m, reach_m)
-    mask = np.full(known.shape, MASK_OUTSIDE, np.uint8)
+    mask = np.full(levels.known.shape, MASK_OUTSIDE, np.uint8)
+    mask[_before_shadow(shadow)] = MASK_UNKNOWN
+    if p.echo_unknown:
+        mask[echo_mask(levels.power, levels.known, p.echo_db)] = MASK_UNKNOWN
     mask[shadow] = MASK_SHADOW
-    mask[(echo | _before_shadow(shadow)) & ~shadow] = MASK_UNKNOWN
-    mask[~known] = MASK_UNKNOWN
+    mask[~levels.known] = MASK_UNKNOWN
     return replace(view, pixels=mask)
 
 
@@ -129,18 +121,19 @@ def _before_shadow(shadow: NDArray[np.bool_]) -> NDArray[np.bool_]:
     the column within the shadow's own length is left open. Only the large patches count: a small one
     may be a hole in the target (a tyre's), with more of its echo behind.
     """
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(shadow.astype(np.uint8), connectivity=8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(shadow.view(np.uint8), connectivity=8)
     unknown = np.zeros(shadow.shape, bool)
     if count < 2:
         return unknown
     areas = stats[1:, cv2.CC_STAT_AREA]
-    rows = np.arange(shadow.shape[0])[:, None]
     for label in np.flatnonzero(areas >= _LARGE_PATCH * areas.max()) + 1:
-        patch = labels == label
+        left, top, width, height = stats[label, :4]
+        patch = labels[top : top + height, left : left + width] == label
         first = patch.argmax(axis=0)
-        last = shadow.shape[0] - 1 - patch[::-1].argmax(axis=0)
-        depth = np.where(patch.any(axis=0), np.minimum(last - first + 1, first), 0)
-        unknown |= (rows < first) & (rows >= first - depth)
+        depth = np.where(patch.any(axis=0), height - patch[::-1].argmax(axis=0) - first, 0)
+        rows = np.arange(top + height)[:, None]
+        first = first + top
+        unknown[: top + height, left : left + width] |= (rows < first) & (rows >= first - depth)
     return unknown
 
 

@@ -42,6 +42,8 @@ _TAPS = 4
 _OVERSAMPLING = 1.5
 #: Entries of the kernel table per sample.
 _TABLE = 2048
+#: Samples of its period by which the small image is extended, so that the kernel never wraps.
+_BORDER = _TAPS
 #: Widening of the band on either side, as a fraction of the bandwidth: a processor's window and a
 #: wobbling track put a little energy outside the nominal annulus.
 _BAND_MARGIN = 0.05
@@ -180,35 +182,44 @@ def _cut_wedge(
             out[ov, du % out_cols] = spectrum[v, (centre[1] + du) % cols] * (factor * w)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _resample(box, table, affine, limits, out):  # pragma: no cover
-    """Interpolate the periodic image `box` at an affine lattice; NaN outside `limits`."""
-    rows, cols = box.shape
-    n_v, n_u = out.shape
-    nan = np.complex64(complex(np.nan, np.nan))
+    """Interpolate an image at an affine lattice; NaN outside `limits`.
+
+    `box` is (rows, cols, 2) float32, extended by `_BORDER` samples of its period on every side;
+    `affine` maps (u, v) to its samples; `out` is (n_v, n_u, 2) float32.
+    """
+    n_v, n_u = out.shape[:2]
+    nan = np.float32(np.nan)
+    entries = np.float32(table.shape[0] - 1)
+    cols = box.shape[1]
+    stride = np.uintp(2 * cols)
+    flat, weights = box.ravel(), table.ravel()
     for v in range(n_v):
+        x0 = affine[0, 1] * v + affine[0, 2]
+        y0 = affine[1, 1] * v + affine[1, 2]
         for u in range(n_u):
-            x = affine[0, 0] * u + affine[0, 1] * v + affine[0, 2]
-            y = affine[1, 0] * u + affine[1, 1] * v + affine[1, 2]
+            x = affine[0, 0] * u + x0
+            y = affine[1, 0] * u + y0
             if x < limits[0] or x > limits[1] or y < limits[2] or y > limits[3]:
-                out[v, u] = nan
+                out[v, u, 0] = nan
+                out[v, u, 1] = nan
                 continue
-            ix = math.floor(x)
-            iy = math.floor(y)
-            wx = table[int((x - ix) * 2048.0 + 0.5)]
-            wy = table[int((y - iy) * 2048.0 + 0.5)]
-            total = np.complex64(0.0)
-            for j in range(4):
-                row = (iy - 1 + j) % rows
-                line = np.complex64(0.0)
-                if 1 <= ix < cols - 2:
-                    for i in range(4):
-                        line += box[row, ix - 1 + i] * wx[i]
-                else:
-                    for i in range(4):
-                        line += box[row, (ix - 1 + i) % cols] * wx[i]
-                total += line * wy[j]
-            out[v, u] = total
+            ix, iy = int(x), int(y)  # not negative: the border is in front
+            # Flat, unsigned indices: the compiler then leaves out the checks for negative ones.
+            wx = np.uintp(int(np.float32(x - ix) * entries + np.float32(0.5)) * 4)
+            wy = np.uintp(int(np.float32(y - iy) * entries + np.float32(0.5)) * 4)
+            w0, w1, w2, w3 = weights[wx], weights[wx + 1], weights[wx + 2], weights[wx + 3]
+            first = np.uintp(((iy - 1) * cols + ix - 1) * 2)
+            re = np.float32(0.0)
+            im = np.float32(0.0)
+            for j in range(np.uintp(4)):
+                w = weights[wy + j]
+                re += w * (w0 * flat[first] + w1 * flat[first + 2] + w2 * flat[first + 4] + w3 * flat[first + 6])
+                im += w * (w0 * flat[first + 1] + w1 * flat[first + 3] + w2 * flat[first + 5] + w3 * flat[first + 7])
+                first += stride
+            out[v, u, 0] = re
+            out[v, u, 1] = im
 
 
 class SubApertures:
@@ -376,14 +387,15 @@ class SubApertures:
         box, _ = self.baseband(aspect_rad)
         # View pixel → ground → image pixel → sample of the small image.
         affine = (self.grid.ground_to_pixel @ info.camera.pixel_to_ground)[:2]
-        scale = np.array([[box.shape[1] / self.spectrum.values.shape[1]], [box.shape[0] / self.spectrum.values.shape[0]]])
-        edge = 0.5
-        limits = np.array(
-            [-edge * scale[0, 0], (self.grid.cols - 1 + edge) * scale[0, 0],
-             -edge * scale[1, 0], (self.grid.rows - 1 + edge) * scale[1, 0]]
-        )  # fmt: skip
+        scale = np.array(box.shape[::-1]) / np.array(self.spectrum.values.shape[::-1])
+        affine = affine * scale[:, None]
+        affine[:, 2] += _BORDER
+        # The image reaches half a pixel beyond the centres of its outer pixels.
+        last = np.array([self.grid.cols, self.grid.rows]) - 0.5
+        limits = np.column_stack([-0.5 * scale, last * scale]).ravel() + _BORDER
+        extended = np.pad(box, _BORDER, mode="wrap").view(np.float32).reshape(*(n + 2 * _BORDER for n in box.shape), 2)
         pixels = np.empty(info.camera.shape, np.complex64)
-        _resample(box, _kernel_table(), affine * scale, limits, pixels)
+        _resample(extended, _kernel_table(), affine, limits, pixels.view(np.float32).reshape(*pixels.shape, 2))
         return View(info, pixels)
 
     def view(self, index: int) -> View:
