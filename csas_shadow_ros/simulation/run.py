@@ -43,7 +43,7 @@ from ..core.errors import ParameterError, check_range
 from ..core.geometry import TWO_PI, Acoustics, CoherentImage, Track
 from .profiles import Faults, Profile, get_profile
 from .scene import SceneModel
-from .targets import make_scene
+from .targets import Scene, make_scene
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -349,7 +349,7 @@ class _BlockMaker:
 
 def simulate(
     profile: str | Profile = "standard",
-    target: str | Path | trimesh.Trimesh = "box",
+    target: str | Path | trimesh.Trimesh | Scene = "box",
     *,
     seed: int = 0,
     position_m: tuple[float, float] = (0.0, 0.0),
@@ -368,8 +368,8 @@ def simulate(
     ----------
     profile : str or Profile
         Name in `PROFILES` (``tiny``, ``small``, ``standard``, ``samdis``), or a profile.
-    target : str, Path or trimesh.Trimesh
-        Name in `TARGETS`, a closed mesh, or a file of one (metres).
+    target : str, Path, trimesh.Trimesh or Scene
+        Name in `TARGETS`, a closed mesh, a file of one (metres), or a scene as it stands.
     seed : int
         Of everything random. The same arguments give the same run bit for bit.
     position_m : (float, float)
@@ -407,7 +407,14 @@ def simulate(
         raise ParameterError(f"seed is {seed!r}; expected a whole number, 0 or more")
     check_range("echo_db", echo_db, -100.0, 100.0, "dB")
     true_acoustics = profile.acoustics(spectrum_sign)
-    scene = make_scene(target, position_m, heading_deg, seed)
+    if not isinstance(target, Scene):
+        scene = make_scene(target, position_m, heading_deg, seed)
+    elif tuple(position_m) == (0.0, 0.0) and heading_deg == 0.0:
+        scene = target
+    else:
+        raise ParameterError(
+            f"position_m is {position_m} and heading_deg {heading_deg:g}; expected neither with a ready scene"
+        )
     streams = [np.random.default_rng([seed, i]) for i in range(4)]
     orbit = _Orbit(profile, faults.track_wobble_m, streams[0])
     phase = _phase_error(faults, streams[1])

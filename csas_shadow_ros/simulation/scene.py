@@ -123,7 +123,8 @@ class SceneModel:
         r1, r2 = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
         a, b, c = (self._triangles[faces, i] for i in range(3))
         points = (1 - r1)[:, None] * a + (r1 * (1 - r2))[:, None] * b + (r1 * r2)[:, None] * c
-        gaussian = (rng.standard_normal(count) + 1j * rng.standard_normal(count)) / math.sqrt(2.0)
+        gaussian = np.empty(count, dtype=np.complex128)
+        gaussian.real, gaussian.imag = rng.standard_normal((2, count)) / math.sqrt(2.0)
         normals = self._face_normals[faces]
         keep = normals[:, 2] > -0.999  # no sonar is under the scene
         power = 10.0 ** (echo_db / 10.0) * float(solid.area) / count
@@ -208,8 +209,7 @@ class SceneModel:
         """
         points, amplitude = self._visible(sonar_m)
         lines, line_amplitude = self._visible_cables(sonar_m)
-        points = np.concatenate([points, lines])
-        amplitude = np.concatenate([amplitude, line_amplitude])
+        points, amplitude = np.concatenate([points, lines]), np.concatenate([amplitude, line_amplitude])
         tan_grazing = sonar_m[2] / math.hypot(sonar_m[0], sonar_m[1])
         layover = points[:, 2] * tan_grazing
         u = (points[:, 0] + layover * math.cos(aspect_rad) - grid.x_min_m) / grid.spacing_m
