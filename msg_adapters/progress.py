@@ -91,6 +91,8 @@ class Heartbeat:
         `source` (makes views), `stage` (passes them on) or `sink` (consumes them).
     counts : mapping of str to int
         Views in, out, rejected, ...
+    values : mapping of str to str
+        Anything else worth telling, such as what the node takes.
     """
 
     stamp_ns: int
@@ -98,6 +100,7 @@ class Heartbeat:
     instance: str
     role: str
     counts: Mapping[str, int] = field(default_factory=dict)
+    values: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.role not in ROLES:
@@ -108,7 +111,8 @@ def progress_to_msg(factory: MessageFactory, item: ViewProgress | Heartbeat) -> 
     """Make the DiagnosticArray (one status) of a view's progress or a heartbeat."""
     if isinstance(item, Heartbeat):
         level, message = Level.OK, HEARTBEAT
-        values = {"role": item.role} | {f"count.{k}": str(int(v)) for k, v in item.counts.items()}
+        counts = {f"count.{k}": str(int(v)) for k, v in item.counts.items()}
+        values = {"role": item.role} | counts | dict(item.values)
     else:
         level = item.level
         message = f"{REJECTED}: {item.reason}" if item.outcome == REJECTED else item.outcome
@@ -167,6 +171,7 @@ def progress_from_msg(msg: Any) -> ViewProgress | Heartbeat:
                 raise AdapterError(
                     f"{where}.status[0].values: {key} is {value!r}; expected a count"
                 ) from None
-        return Heartbeat(stamp, status.name, status.hardware_id, values.get("role", ""), counts)
+        others = {k: v for k, v in values.items() if k != "role" and not k.startswith("count.")}
+        return Heartbeat(stamp, status.name, status.hardware_id, values.get("role", ""), counts, others)
     outcome, _, reason = status.message.partition(": ")
     return ViewProgress(stamp, status.name, status.hardware_id, outcome, reason, Level(code), values)
