@@ -314,6 +314,8 @@ class BagWriter:
         Replace a bag that is there. Anything but a bag is never removed.
     depth : int
         Depth of the QoS that is offered on playing, for topics made without one.
+    file_name : str, optional
+        Name of the MCAP file; ``<directory>_0.mcap`` by default, as rosbag2 has it.
 
     Raises
     ------
@@ -322,7 +324,13 @@ class BagWriter:
     """
 
     def __init__(
-        self, path: str | Path, *, compress: bool = True, overwrite: bool = False, depth: int = 100
+        self,
+        path: str | Path,
+        *,
+        compress: bool = True,
+        overwrite: bool = False,
+        depth: int = 100,
+        file_name: str | None = None,
     ) -> None:
         self.path = Path(path)
         self._depth = depth
@@ -335,7 +343,7 @@ class BagWriter:
             self._make_room(overwrite)
         try:
             self.path.mkdir(parents=True)
-            self.file = self.path / f"{self.path.resolve().name}_0.mcap"
+            self.file = self.path / (file_name or f"{self.path.resolve().name}_0.mcap")
             self._stream = self.file.open("wb")
         except OSError as error:
             raise BagError(f"cannot make {self.path}: {error.strerror}") from error
