@@ -22,6 +22,9 @@ NANOSECONDS = 1_000_000_000
 #: ``builtin_interfaces/Time.sec`` is an int32.
 MAX_STAMP_NS = (1 << 31) * NANOSECONDS - 1
 
+#: Defaults that are not zero or empty in the common interfaces.
+_DEFAULTS: dict[str, dict[str, Any]] = {"geometry_msgs/msg/Quaternion": {"w": 1.0}}
+
 FLOAT_TYPES = ("float", "double", "float32", "float64")
 
 
@@ -120,6 +123,7 @@ class RosbagsMessages:
             raise AdapterError(
                 f"{type_name} has no field {unknown[0]!r}; expected one of: {', '.join(sorted(known))}"
             )
+        fields = _DEFAULTS.get(type_name, {}) | fields
         return cls(**{name: fields[name] if name in fields else self._default(kind) for name, kind in names})
 
     def _default(self, kind: Any) -> Any:
