@@ -646,6 +646,11 @@ class Track:
         # crosses the aspect, whatever the direction and however the track wobbles.
         turns = np.floor((a - aspect_rad) / TWO_PI + 1e-12)
         crossing = np.flatnonzero((np.diff(turns) != 0) & (np.abs(self._steps()) <= self.max_gap_rad))
+        # A pose may sit exactly on the aspect without a crossing: at the track's start, or beside a gap.
+        exact = np.flatnonzero(np.abs(wrap_angle(a - aspect_rad)) < 1e-9)
+        if exact.size and (not crossing.size or exact[0] <= crossing[0]):
+            i = int(exact[0])
+            return int(self.stamps_ns[i]), self.positions_m[i].copy()
         if crossing.size:
             i = int(crossing[0])
             target = aspect_rad + TWO_PI * max(turns[i], turns[i + 1])
@@ -654,10 +659,7 @@ class Track:
             position = (1.0 - f) * self.positions_m[i] + f * self.positions_m[i + 1]
             stamp = int(self.stamps_ns[i]) + round(f * int(self.stamps_ns[i + 1] - self.stamps_ns[i]))
             return stamp, position
-        # A pose may sit exactly on the aspect at either end; and a circle of n poses closes on itself.
-        for i in (0, len(a) - 1):
-            if abs(float(wrap_angle(a[i] - aspect_rad))) < 1e-9:
-                return int(self.stamps_ns[i]), self.positions_m[i].copy()
+        # A circle of n poses closes on itself.
         closing = float(wrap_angle(a[0] - a[-1]))
         beyond = float(wrap_angle(aspect_rad - a[-1]))
         if (
