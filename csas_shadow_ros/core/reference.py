@@ -37,8 +37,10 @@ def sub_aperture(image: CoherentImage, aspect_rad: float, aperture_rad: float) -
     """
     kx, ky = wavenumbers(image)
     angle = np.arctan2(image.acoustics.spectrum_sign * ky, image.acoustics.spectrum_sign * kx)
-    look = np.angle(np.exp(1j * (angle - aspect_rad)))
-    mask = (look >= -aperture_rad / 2) & (look < aperture_rad / 2)
+    # Rounded, so that a wavenumber on the edge of two neighbouring apertures lies in one of them.
+    look = np.round(np.angle(np.exp(1j * (angle - aspect_rad))), 9)
+    half = round(aperture_rad / 2, 9)
+    mask = (look >= -half) & (look < half)
     return np.fft.ifft2(np.fft.fft2(image.pixels) * mask)
 
 
