@@ -60,7 +60,10 @@ def check_range(
     ParameterError
         If the value is not a finite number inside the bounds.
     """
-    number = float(value)
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise ParameterError(f"{name} is {value!r}; expected a number") from None
     inside = (low < number if open_low else low <= number) and number <= high
     if not inside:  # also true for NaN
         bracket = "(" if open_low else "["

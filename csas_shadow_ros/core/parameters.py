@@ -41,7 +41,7 @@ def _check_number(name: str, value: Any, field: dataclasses.Field[Any]) -> float
     kind = int if isinstance(field.default, int) else float
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ParameterError(f"{name} is {value!r}; expected a number{unit and ' in' + unit}")
-    if kind is int and float(value) != int(value):
+    if kind is int and math.isfinite(value) and float(value) != int(value):
         raise ParameterError(f"{name} is {value!r}; expected a whole number")
     low, high = meta["low"], meta["high"]
     if not math.isfinite(value) or (low is not None and value < low) or (high is not None and value > high):
