@@ -131,7 +131,7 @@ class BagReader:
 
     @property
     def has_checksums(self) -> bool:
-        """Whether changed bits would have been noticed."""
+        """Whether changed bits would have been noticed in what was read so far."""
         return self._foreign is None and all(f.has_checksums for f in self._files)
 
     def _complain(self, problem: str) -> None:

@@ -90,7 +90,7 @@ class McapFile:
         self.compressions: set[str] = set()
         #: False if the file ends early or its index is damaged.
         self.complete = True
-        #: False if some messages are not covered by a checksum.
+        #: False if some of the messages read so far are not covered by a checksum.
         self.has_checksums = True
         self._schemas: dict[int, Schema] = {}
         self._chunks: list[ChunkIndex] = []
@@ -237,9 +237,8 @@ class McapFile:
             try:
                 op, body = self._read_record(file)
             except _ShortError as error:
-                if self.complete:
-                    self.complete = False
-                    complain(f"{self.path.name}: ends in the middle of a record at byte {offset} ({error})")
+                self.complete = False
+                complain(f"{self.path.name}: ends in the middle of a record at byte {offset} ({error})")
                 return
             if op == _DATA_END:
                 (crc,) = struct.unpack_from("<I", body)

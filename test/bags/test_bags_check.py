@@ -1,0 +1,372 @@
+"""Checking a bag: a sound one passes, and each fault is found, placed and given a remedy."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from csas_shadow_ros.bags import BagWriter, check_bag, write_run
+from csas_shadow_ros.bags.check import (
+    band_energy,
+    check_spectrum_sign,
+    judge_band,
+    judge_energy,
+    judge_geometry,
+)
+from csas_shadow_ros.core.errors import ViewError
+from csas_shadow_ros.core.geometry import (
+    Acoustics,
+    CoherentImage,
+    GroundGrid,
+    ShadowCamera,
+    Track,
+    View,
+    ViewInfo,
+    view_ground_to_pixel,
+)
+from csas_shadow_ros.core.target import SignEvidence
+from msg_adapters import RosbagsMessages, coherent_image_to_msgs, track_to_msg, view_to_msgs
+
+START_NS = 1_700_000_000_000_000_000
+ACOUSTICS = Acoustics(120e3, 40e3, 1500.0, -1)
+FACTORY = RosbagsMessages()
+SPACING_M = 0.0025
+SIDE = 128
+
+
+def circle(n=360, arc=2 * np.pi, radius=75.0, height=18.0):
+    aspects = np.arange(n) * arc / n
+    positions = np.column_stack([radius * np.cos(aspects), radius * np.sin(aspects), np.full(n, height)])
+    return Track(START_NS + np.arange(n) * 1_000_000_000, positions)
+
+
+def annulus_image(acoustics=ACOUSTICS, spacing=SPACING_M, seed=0):
+    """Noise whose spectrum fills the band's annulus, as circular SAS leaves it."""
+    grid = GroundGrid.centred(SIDE, SIDE, spacing)
+    k = 2 * np.pi * np.fft.fftfreq(SIDE, SPACING_M)
+    low, _, high = ACOUSTICS.ground_band(math.atan2(18, 75))
+    radius = np.hypot(k[:, None], k[None, :])
+    rng = np.random.default_rng(seed)
+    spectrum = rng.standard_normal((SIDE, SIDE)) + 1j * rng.standard_normal((SIDE, SIDE))
+    spectrum[(radius < low) | (radius > high)] = 0
+    return CoherentImage(np.fft.ifft2(spectrum).astype(np.complex64), grid, acoustics, START_NS)
+
+
+@pytest.fixture(autouse=True)
+def no_search(request, monkeypatch):
+    """Leave out the search for shadows, which these images have none of."""
+    if "sign" not in request.node.name:
+        monkeypatch.setattr("csas_shadow_ros.bags.check.check_spectrum_sign", lambda image, track: ())
+
+
+def only(report, level="error"):
+    (finding,) = [f for f in report.findings if f.level == level]
+    return finding
+
+
+def test_a_sound_run_passes_without_a_word_of_blame(tmp_path):
+    report = check_bag(write_run(tmp_path / "run", annulus_image(), circle()))
+    assert report.ok
+    assert {f.level for f in report.findings} == {"info"}
+    assert report.usable == {"track": 360, "image": 1}
+    assert report.topics == {"/csas/image": 1, "/csas/camera_info": 1, "/csas/track": 1}
+    assert "processing can start from image and track" in str(report)
+
+
+def test_the_report_is_json(tmp_path):
+    report = check_bag(write_run(tmp_path / "run", annulus_image(), None))
+    data = json.loads(report.to_json())
+    assert data["ok"] is False
+    assert data["findings"][0]["level"] == "error"
+    assert set(data["findings"][0]) == {"level", "topic", "number", "stamp_ns", "problem", "remedy"}
+
+
+@pytest.mark.parametrize("encoding", ["8SC2", "16SC2", "32FC2", "64FC2"])
+def test_every_encoding_passes(tmp_path, encoding):
+    assert check_bag(write_run(tmp_path / "run", annulus_image(), circle(), encoding=encoding)).ok
+
+
+def test_what_is_no_bag_is_an_error_and_not_an_exception(tmp_path):
+    finding = only(check_bag(tmp_path / "nothing"))
+    assert "there is no bag at" in finding.problem
+    assert finding.remedy
+
+
+def test_an_empty_bag_has_nothing_to_start_from(tmp_path):
+    BagWriter(tmp_path / "run").close()
+    report = check_bag(tmp_path / "run")
+    text = str(report)
+    assert not report.ok
+    assert "the bag holds no messages" in text
+    assert "nothing to start from" in text
+    assert "Record /csas/image, /csas/camera_info, /csas/track" in text
+
+
+def test_an_image_without_a_track_is_not_enough(tmp_path):
+    finding = only(check_bag(write_run(tmp_path / "run", annulus_image(), None)))
+    assert finding.topic == "/csas/track"
+    assert "no usable track" in finding.problem
+    assert "Record /csas/track (nav_msgs/Path)" in finding.remedy
+
+
+def write(path, *messages):
+    with BagWriter(path) as writer:
+        for topic, msg in messages:
+            writer.write(topic, msg, START_NS)
+    return path
+
+
+def run_messages(image=None, track=None):
+    a, b = coherent_image_to_msgs(FACTORY, image or annulus_image())
+    return a, b, track_to_msg(FACTORY, track or circle())
+
+
+def spoil_step(a, b, c):
+    a.step = 3
+
+
+def spoil_nan(a, b, c):
+    a.data = a.data.copy()
+    a.data[:4] = np.frombuffer(np.float32(np.nan).tobytes(), np.uint8)
+
+
+def spoil_zero(a, b, c):
+    a.data = np.zeros_like(a.data)
+
+
+def spoil_encoding(a, b, c):
+    a.encoding = "32FC1"
+
+
+def spoil_model(a, b, c):
+    b.distortion_model = "plumb_bob"
+
+
+def spoil_sign(a, b, c):
+    b.d = np.array([120e3, 40e3, 1500.0, 0.0])
+
+
+def spoil_stamp(a, b, c):
+    b.header.stamp.sec += 1
+
+
+def spoil_size(a, b, c):
+    b.width += 1
+
+
+def spoil_frame(a, b, c):
+    c.header.frame_id = "map"
+
+
+def spoil_order(a, b, c):
+    c.poses[3], c.poses[4] = c.poses[4], c.poses[3]
+
+
+def spoil_depth(a, b, c):
+    c.poses[9].pose.position.z = -18.0
+
+
+@pytest.mark.parametrize(
+    ("spoil", "topic", "problem", "remedy"),
+    [
+        (spoil_step, "/csas/image", "image.step is 3 bytes; expected 1024", "publisher of /csas/image"),
+        (spoil_nan, "/csas/image", "1 of 16384 pixels not finite, the first at row 0, column 0", "publisher"),
+        (spoil_zero, "/csas/image", "holds only zeros", "publisher"),
+        (spoil_encoding, "/csas/image", "encoding is '32FC1'", "publisher"),
+        (spoil_model, "/csas/image", "distortion_model is 'plumb_bob'", "publisher"),
+        (spoil_sign, "/csas/image", "spectrum_sign, is 0; expected +1 or -1", "publisher"),
+        (spoil_stamp, "/csas/image", "has no camera_info of the same stamp", "the very same header.stamp"),
+        (spoil_size, "/csas/image", "camera_info.width is 129; expected", "publisher"),
+        (spoil_frame, "/csas/track", "frame_id is 'map'; expected 'csas_scene'", "publisher of /csas/track"),
+        (spoil_order, "/csas/track", "out of order: pose 4 ", "publisher of /csas/track"),
+        (spoil_depth, "/csas/track", "pose 9 is at z = -18 m", "publisher of /csas/track"),
+    ],
+)
+def test_each_fault_is_placed_and_has_a_remedy(tmp_path, spoil, topic, problem, remedy):
+    a, b, c = run_messages()
+    spoil(a, b, c)
+    path = write(tmp_path / "run", ("/csas/image", a), ("/csas/camera_info", b), ("/csas/track", c))
+    report = check_bag(path)
+    assert not report.ok
+    found = [f for f in report.findings if f.level == "error" and problem in f.problem]
+    assert len(found) == 1
+    assert (found[0].topic, found[0].number) == (topic, 0)
+    assert found[0].stamp_ns is not None
+    assert remedy in found[0].remedy
+
+
+def test_a_topic_of_another_type_is_named_with_the_right_one(tmp_path):
+    a, b, _ = run_messages()
+    wrong = FACTORY.make("geometry_msgs/msg/PoseStamped")
+    report = check_bag(
+        write(tmp_path / "run", ("/csas/image", a), ("/csas/camera_info", b), ("/csas/track", wrong))
+    )
+    (finding,) = [f for f in report.findings if "its type is" in f.problem]
+    assert "'geometry_msgs/msg/PoseStamped'; expected nav_msgs/msg/Path" in finding.problem
+    assert finding.remedy == "Publish /csas/track as nav_msgs/msg/Path."
+
+
+def test_a_track_with_a_gap_is_usable_with_a_warning(tmp_path):
+    report = check_bag(write_run(tmp_path / "run", annulus_image(), circle(300, np.radians(300))))
+    assert report.ok
+    finding = only(report, "warning")
+    assert "covers 299.0 of 360 degrees; missing: 299.0° to 360.0°" in finding.problem
+
+
+def test_a_damaged_bag_is_not_ok_even_if_it_can_be_read(tmp_path):
+    path = write_run(tmp_path / "run", annulus_image(), circle())
+    (path / "metadata.yaml").unlink()
+    assert "metadata.yaml is missing" in only(check_bag(path)).problem
+
+
+def view(degrees, sonar_range=75.0):
+    aspect = math.radians(degrees)
+    sonar = (sonar_range * math.cos(aspect), sonar_range * math.sin(aspect), 18.0 * sonar_range / 75.0)
+    camera = ShadowCamera.from_ground(view_ground_to_pixel(aspect, 0.02, 8, 9, (0, 0)), sonar, 8, 9)
+    info = ViewInfo(START_NS + degrees * 1_000_000_000, camera, ACOUSTICS, aspect, math.radians(12))
+    return View(info, np.random.default_rng(degrees).random((8, 9)).astype(np.float32))
+
+
+def test_a_later_stage_alone_is_enough_to_start_from(tmp_path):
+    extra = []
+    for d in (0, 10, 20):
+        a, b = view_to_msgs(FACTORY, view(d), "likelihood")
+        extra += [("likelihood/image", a), ("likelihood/camera_info", b)]
+    report = check_bag(write_run(tmp_path / "run", None, None, extra=extra))
+    assert report.ok
+    assert "processing can start from likelihood (3 views)" in str(report)
+
+
+def test_a_view_whose_sonar_is_off_the_track_is_a_warning(tmp_path):
+    good, bad = view_to_msgs(FACTORY, view(5), "shadow"), view_to_msgs(FACTORY, view(10, 60.0), "shadow")
+    extra = [
+        (t, m)
+        for pair in (good, bad)
+        for t, m in zip(("shadow/image", "shadow/camera_info"), pair, strict=True)
+    ]
+    finding = only(check_bag(write_run(tmp_path / "run", None, circle(), extra=extra)), "warning")
+    assert finding.number == 1
+    assert "15.43 m from the track at that stamp" in finding.problem
+
+
+def test_a_view_outside_the_tracks_time_is_a_warning(tmp_path):
+    late = view(10)
+    late = View(replace(late.info, stamp_ns=START_NS + 10**13), late.pixels)
+    a, b = view_to_msgs(FACTORY, late, "shadow")
+    report = check_bag(
+        write_run(tmp_path / "run", None, circle(), extra=[("shadow/image", a), ("shadow/camera_info", b)])
+    )
+    assert "outside the track's time" in only(report, "warning").problem
+
+
+# --- band and geometry
+
+
+def levels(findings):
+    return [level for level, _, _ in findings]
+
+
+def test_an_image_holds_all_its_energy_in_its_stated_band():
+    energy = band_energy(annulus_image(), circle().grazing_rad)
+    low, _, high = ACOUSTICS.ground_band(circle().grazing_rad)
+    assert energy.fraction > 0.999
+    assert 0.95 * low < energy.low_rad_m < energy.high_rad_m < 1.05 * high
+    assert levels(judge_energy(annulus_image(), circle())) == []
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"acoustics": Acoustics(60e3, 20e3, 1500.0, -1)},
+        {"acoustics": Acoustics(120e3, 40e3, 5000.0, -1)},
+        {"spacing": 0.005},
+    ],
+    ids=["frequency", "sound speed", "pixel spacing"],
+)
+def test_a_wrong_frequency_sound_speed_or_spacing_is_found(wrong):
+    ((level, problem, remedy),) = judge_energy(annulus_image(**wrong), circle())
+    assert level == "error"
+    assert "of the image's energy lies in its stated band" in problem
+    assert "check centre frequency, bandwidth and sound speed" in remedy
+
+
+def test_the_remedy_names_the_frequencies_where_the_energy_is():
+    wrong = annulus_image(acoustics=Acoustics(60e3, 20e3, 1500.0, -1))
+    _, _, remedy = next(iter(judge_energy(wrong, circle())))
+    low, high = (float(x) for x in remedy.split("that is ")[1].split(" Hz")[0].split(" to "))
+    assert 98e3 < low < 108e3
+    assert 132e3 < high < 142e3
+
+
+def test_a_band_beyond_the_pixels_is_an_error_and_just_beyond_a_warning():
+    high = ACOUSTICS.ground_band(circle().grazing_rad)[2]
+
+    def at(factor):
+        grid = GroundGrid.centred(64, 64, math.pi / high * factor)
+        return levels(judge_band(grid, ACOUSTICS, circle()))
+
+    assert at(0.999) == []
+    assert at(1.05) == ["warning"]
+    assert at(1.2) == ["error"]
+
+
+@settings(max_examples=50)
+@given(factor=st.floats(0.2, 5.0), height=st.floats(1, 100))
+def test_the_band_fits_exactly_up_to_nyquist(factor, height):
+    track = circle(height=height)
+    high = ACOUSTICS.ground_band(track.grazing_rad)[2]
+    grid = GroundGrid.centred(64, 64, math.pi / high * factor)
+    expected = [] if factor <= 1 else ["warning"] if factor <= 1.1 else ["error"]
+    if min(abs(factor - 1), abs(factor - 1.1)) > 1e-9:
+        assert levels(judge_band(grid, ACOUSTICS, track)) == expected
+
+
+def test_a_track_over_the_image_or_beside_it_is_an_error():
+    grid = GroundGrid.centred(100, 100, 0.1)
+    assert levels(judge_geometry(grid, circle())) == []
+    ((level, problem, _),) = judge_geometry(grid, circle(radius=4.0))
+    assert (level, "track pose 0 at (4.00, 0.00) m is over the image" in problem) == ("error", True)
+    ((level, problem, _),) = judge_geometry(GroundGrid.centred(100, 100, 0.1, (200.0, 0.0)), circle())
+    assert (level, "200.0 m from the centre of the track's circle (radius 75.0)" in problem) == (
+        "error",
+        True,
+    )
+
+
+# --- spectrum sign
+
+
+@pytest.mark.parametrize(
+    ("evidence", "level", "text"),
+    [
+        (SignEvidence(-1, 100.0, 0.0), "info", "spectrum_sign is -1: shadows fall away from the sonar"),
+        (SignEvidence(-1, 0.0, 100.0), "error", "shadows fall towards the sonar"),
+        (SignEvidence(-1, 0.0, 0.0), "info", "no shadows to tell by"),
+    ],
+)
+def test_evidence_for_the_spectrum_sign_becomes_a_finding(monkeypatch, evidence, level, text):
+    monkeypatch.setattr("csas_shadow_ros.core.target.spectrum_sign_evidence", lambda i, t: (evidence, None))
+    ((found, problem, remedy),) = check_spectrum_sign(annulus_image(), circle())
+    assert found == level
+    assert text in problem
+    assert (remedy == "Set spectrum_sign (camera_info.d[3]) to +1.") == (level == "error")
+
+
+def test_a_spectrum_sign_that_cannot_be_checked_is_a_warning(monkeypatch):
+    def fail(image, track):
+        raise ViewError("no aspect is covered")
+
+    monkeypatch.setattr("csas_shadow_ros.core.target.spectrum_sign_evidence", fail)
+    ((level, problem, _),) = check_spectrum_sign(annulus_image(), circle())
+    assert (level, problem) == ("warning", "the spectrum sign cannot be checked: no aspect is covered")
+
+
+def test_the_spectrum_sign_is_checked_with_the_method_itself(tmp_path):
+    report = check_bag(write_run(tmp_path / "run", annulus_image(), circle()))
+    assert any("spectrum sign" in f.problem or "spectrum_sign" in f.problem for f in report.findings)
