@@ -409,7 +409,7 @@ class BagWriter:
             message_encoding="cdr",
             schema_id=schema,
             metadata={
-                "offered_qos_profiles": yaml.safe_dump(qos, sort_keys=False).strip(),
+                "offered_qos_profiles": _dump(qos).strip(),
                 "topic_type_hash": digest,
             },
         )
@@ -489,6 +489,22 @@ class BagWriter:
         self._first = log_time_ns if self._first is None else min(self._first, log_time_ns)
         self._last = max(self._last, log_time_ns)
 
+    def flush(self) -> None:
+        """Bring what was written so far to the disk: a crash then costs nothing of it.
+
+        Raises
+        ------
+        BagError
+            If the disk refuses.
+        """
+        if self._closed:
+            return
+        try:
+            self._writer.flush()
+            self._stream.flush()
+        except OSError as error:
+            raise BagError(f"cannot write to {self.file}: {error.strerror}") from error
+
     def close(self) -> None:
         """Finish the file and write the metadata; a second call does nothing.
 
@@ -502,12 +518,12 @@ class BagWriter:
         self._closed = True
         information = self._information()
         try:
-            text = yaml.safe_dump(information, sort_keys=False)
+            text = _dump(information)
             self._writer.add_metadata("rosbag2", {"serialized_metadata": text})
             self._writer.finish()
             self._stream.close()
             partial = self.path / f"{METADATA}.tmp"
-            whole = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
+            whole = _dump({"rosbag2_bagfile_information": information})
             partial.write_text(whole, encoding="utf-8")
             partial.replace(self.path / METADATA)
         except (OSError, McapError) as error:
@@ -545,6 +561,17 @@ class BagWriter:
             "custom_data": None,
             "ros_distro": "jazzy",
         }
+
+
+class _PlainDumper(yaml.SafeDumper):
+    """Writes equal parts out: not every reader of metadata knows YAML's anchors."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _dump(data: Any) -> str:
+    return yaml.dump(data, Dumper=_PlainDumper, sort_keys=False)
 
 
 def _serialise(message: Any, type_name: str) -> Any:

@@ -248,6 +248,7 @@ def test_rosbags_and_mcap_read_our_bags_with_definitions_checksums_and_qos(tmp_p
     info = yaml.safe_load((path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert (info["version"], info["storage_identifier"], info["message_count"]) == (9, "mcap", 3)
     assert info["relative_file_paths"] == ["run_0.mcap"]
+    assert "&id" not in (path / "metadata.yaml").read_text()
     ours = BagReader(path)
     assert len(list(ours.messages())) == 3
     assert ours.has_checksums
