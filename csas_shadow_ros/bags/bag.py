@@ -571,7 +571,8 @@ class _PlainDumper(yaml.SafeDumper):
 
 
 def _dump(data: Any) -> str:
-    return yaml.dump(data, Dumper=_PlainDumper, sort_keys=False)
+    text: str = yaml.dump(data, Dumper=_PlainDumper, sort_keys=False)
+    return text
 
 
 def _serialise(message: Any, type_name: str) -> Any:
