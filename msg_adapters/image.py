@@ -253,8 +253,8 @@ def check_pixels(pixels: NDArray[Any], kind: ImageStream) -> None:
     """Refuse pixels that break the stream's rule.
 
     Coherent images must be finite. Views may hold NaN where they know nothing, never infinities;
-    amplitudes are not negative, likelihoods lie in [0, 1], masks hold 0, 255 and 128 (unknown). An image that holds
-    only zeros, or a view that knows nothing at all, is no measurement.
+    amplitudes are not negative, likelihoods lie in [0, 1], masks hold 0, 255 and 128 (unknown). An image
+    that holds only zeros, or a view that knows nothing at all, is no measurement.
 
     Raises
     ------

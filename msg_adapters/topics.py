@@ -145,7 +145,11 @@ STREAMS: dict[str, ImageStream] = {
             "likelihood of lying outside the shadow, 0 to 1; NaN where the view knows nothing",
         ),
         ImageStream(
-            "shadow_mask", ("mono8",), CSAS_SHADOW, "mask", "segmented target shadow: 255 shadow, 0 not, 128 unknown"
+            "shadow_mask",
+            ("mono8",),
+            CSAS_SHADOW,
+            "mask",
+            "segmented target shadow: 255 shadow, 0 not, 128 unknown",
         ),
         ImageStream(
             "multilook", ("32FC1",), CSAS_IMAGE, "amplitude", "multilook amplitude over the circle, north up"
