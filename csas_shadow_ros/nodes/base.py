@@ -1,0 +1,784 @@
+"""What all nodes share: parameters, lifecycle, reports, diagnostics, joined inputs and flow control."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import sys
+import tempfile
+import threading
+import time
+import traceback
+import uuid
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import rclpy
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.signals import SignalHandlerOptions
+
+from csas_shadow_ros.core.errors import CsasError, ParameterError
+from csas_shadow_ros.core.geometry import View
+from csas_shadow_ros.core.target import Target
+from msg_adapters import (
+    TOPICS,
+    Heartbeat,
+    Level,
+    Pairer,
+    RclpyMessages,
+    TargetBox,
+    ViewProgress,
+    diagnostics_to_msg,
+    progress_from_msg,
+    progress_to_msg,
+    stamp_to_ns,
+    target_from_msg,
+    view_to_msgs,
+)
+from msg_adapters.progress import INTEGRATED, PUBLISHED, REJECTED
+from msg_adapters.topics import stream as stream_of
+
+from . import qos
+from .flow import Flow
+from .params import NODES, declare, from_overrides
+
+NAMESPACE = "csas"
+BEAT_S = 0.5
+_LOG_EVERY_S = 10.0
+_MAX_KINDS = 32
+_LONELY_S = 5.0
+
+
+def kind_of(reason: str) -> str:
+    """Return what kind of reason it is: the reason without its numbers."""
+    return re.sub(r"-?\d[\d.,e+-]*", "#", reason)[:160]
+
+
+class CsasNode(LifecycleNode):
+    """A lifecycle node of the package.
+
+    Subclasses set `name` and override `setup`, which makes publishers, inlets and sources.
+
+    Parameters
+    ----------
+    context : Context, optional
+        rclpy context; the default one otherwise.
+    namespace : str
+        Namespace unless the command line remaps it.
+    overrides : mapping, optional
+        Parameter values, besides those of the command line.
+    arguments : sequence of str, optional
+        ROS arguments of this node alone (``--ros-args …``).
+
+    Raises
+    ------
+    ParameterError
+        If a parameter is unknown or out of range.
+    """
+
+    name: ClassVar[str] = ""
+
+    def __init__(
+        self,
+        *,
+        context: Context | None = None,
+        namespace: str = NAMESPACE,
+        overrides: Mapping[str, Any] | None = None,
+        arguments: Sequence[str] | None = None,
+    ) -> None:
+        super().__init__(
+            self.name,
+            context=context,
+            namespace=namespace,
+            cli_args=list(arguments) if arguments else None,
+            parameter_overrides=[Parameter(k, value=v) for k, v in (overrides or {}).items()],
+        )
+        given = {name: p.value for name, p in self._parameter_overrides.items()}
+        self.parameters: Any = from_overrides(NODES[self.name], given)
+        declare(self, self.parameters)
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+        self.instance = uuid.uuid4().hex[:12]
+        self.messages = RclpyMessages()
+        self.active = False
+        self.counts: Counter[str] = Counter()
+        self.reasons: Counter[str] = Counter()
+        self.busy_s = 0.0
+        #: What stops the node from working, if anything does; shown in diagnostics and heartbeats.
+        self.error = ""
+        self.inlets: list[Inlet] = []
+        self.sources: list[Source] = []
+        self._owned: list[tuple[Callable[[Any], Any], Any]] = []
+        self._logged: dict[str, tuple[float, int]] = {}
+        self._rates: dict[str, tuple[int, float]] = {}
+        self._beat_lock = threading.Lock()
+        self._beat_stop = threading.Event()
+        self._beat_thread: threading.Thread | None = None
+
+    # To override
+
+    def setup(self) -> None:
+        """Make publishers, inlets and sources."""
+
+    def forget(self) -> None:
+        """Drop the state that a run leaves; called on cleanup."""
+
+    def finish(self) -> None:
+        """Bring what must survive to an end; called on deactivation and shutdown."""
+
+    def on_activated(self) -> None:
+        """Do what is to be done once when the work begins."""
+
+    def tick(self) -> None:
+        """Do what is to be done a few times a second."""
+
+    def state_counts(self) -> dict[str, int]:
+        """Return counts for the heartbeat, besides the common ones."""
+        return {}
+
+    def waiting(self) -> str:
+        """Say what the node waits for; empty if for nothing."""
+        return ""
+
+    def on_source(self, beat: Heartbeat) -> None:
+        """Take a source's heartbeat; only nodes that `follow_sources` get them."""
+
+    # Making entities that live from configure to cleanup
+
+    def publisher(self, topic: str, profile: Any, type_name: str | None = None) -> Publisher:
+        """Make a publisher of a topic of the contract."""
+        made = self.create_publisher(self.messages.cls(type_name or TOPICS[topic].type_name), topic, profile)
+        self._owned.append((self.destroy_publisher, made))
+        return made
+
+    def subscribe(
+        self, topic: str, profile: Any, callback: Callable[[Any], None], *, raw: bool = False
+    ) -> None:
+        """Subscribe to a topic of the contract; nothing that the callback raises ends the node."""
+
+        def guarded(msg: Any) -> None:
+            if self.active:
+                self.guard(topic, callback, msg)
+
+        kind = self.messages.cls(TOPICS[topic].type_name)
+        made = self.create_subscription(kind, topic, guarded, profile, raw=raw)
+        self._owned.append((self.destroy_subscription, made))
+
+    def subscribe_latched(self, topic: str, callback: Callable[[Any], None], *, raw: bool = False) -> None:
+        """Subscribe to a latched topic, whether or not its publisher really latches it."""
+        self.subscribe(topic, qos.LATCHED, callback, raw=raw)
+        self.subscribe(topic, qos.UNLATCHED, callback, raw=raw)
+
+    def every(self, period_s: float, callback: Callable[[], None]) -> None:
+        """Call back periodically while the node is configured."""
+        made = self.create_timer(period_s, lambda: self.guard("timer", callback))
+        self._owned.append((self.destroy_timer, made))
+
+    def trigger(self, callback: Callable[[], None]) -> Any:
+        """Make a guard condition: work that is done between other callbacks, a piece at a time."""
+        made = self.create_guard_condition(lambda: self.guard("work", callback))
+        self._owned.append((self.destroy_guard_condition, made))
+        return made
+
+    def follow_sources(self) -> None:
+        """Listen to the sources' heartbeats."""
+        self.subscribe("progress", qos.REPORTS, self._on_progress)
+
+    def _on_progress(self, msg: Any) -> None:
+        item = progress_from_msg(msg)
+        if isinstance(item, Heartbeat) and item.role == "source":
+            self.on_source(item)
+
+    # Errors
+
+    def guard(self, where: str, work: Callable[..., None], *args: Any) -> None:
+        """Run a piece of work: whatever goes wrong is counted and named, and the node goes on."""
+        start = time.perf_counter()
+        try:
+            work(*args)
+        except CsasError as error:
+            self.reject(str(error))
+        except InvalidHandle:
+            return  # the node is being torn down
+        except Exception as error:
+            self.fault(where, error)
+        finally:
+            self.busy_s += time.perf_counter() - start
+
+    def fault(self, where: str, error: BaseException) -> None:
+        """Count an error that is none of ours, with its traceback in the log."""
+        self.reject(f"{where}: {type(error).__name__}: {error}", level="error")
+        self.get_logger().debug("".join(traceback.format_exception(error)))
+
+    def reject(self, reason: str, *, level: str = "warn") -> None:
+        """Count something that cannot be used, and name it in the log: each kind at most every 10 s."""
+        self.counts["rejected"] += 1
+        kind = kind_of(reason)
+        if kind not in self.reasons and len(self.reasons) >= _MAX_KINDS:
+            kind = "other reasons"
+        self.reasons[kind] += 1
+        self.log_throttled(kind, reason, level)
+
+    def log_throttled(self, kind: str, text: str, level: str) -> None:
+        """Log a line unless one of its kind was logged just before; then count it."""
+        now = time.monotonic()
+        since, held = self._logged.get(kind, (-_LOG_EVERY_S, 0))
+        if now - since < _LOG_EVERY_S:
+            self._logged[kind] = (since, held + 1)
+            return
+        self._logged[kind] = (now, 0)
+        more = f" (and {held} more of this kind)" if held else ""
+        # rclpy remembers a severity per calling line, so each level has its own.
+        if level == "error":
+            self.get_logger().error(f"{text}{more}")
+        else:
+            self.get_logger().warning(f"{text}{more}")
+
+    # Reports and diagnostics
+
+    def now_ns(self) -> int:
+        """Return the node's time."""
+        return int(self.get_clock().now().nanoseconds)
+
+    def send_report(self, item: ViewProgress) -> None:
+        """Publish what became of a view."""
+        self._reports.publish(progress_to_msg(self.messages, item))
+
+    def _send_beats(self, *, leaving: bool = False) -> None:
+        for voice in (*self.inlets, *self.sources):
+            beat = voice.beat(leaving=leaving)
+            self._heartbeats.publish(progress_to_msg(self.messages, beat))
+
+    def common_counts(self) -> dict[str, int]:
+        """Return the counts that every heartbeat carries."""
+        names = ("in", "out", "rejected", "duplicates")
+        counts = {name: self.counts[name] for name in names} | {"busy_ms": int(self.busy_s * 1e3)}
+        return counts | self.state_counts()
+
+    def _beat_on(self) -> None:
+        # A thread of its own: a stage that computes for seconds is busy, not gone.
+        while not self._beat_stop.wait(BEAT_S):
+            with self._beat_lock:
+                if self.active and not self._beat_stop.is_set():
+                    try:
+                        self._send_beats()
+                    except (InvalidHandle, RuntimeError) as error:
+                        # The context was shut down under us, or counts changed while they were read.
+                        if not self.context.ok():
+                            return
+                        self.get_logger().debug(f"skipped a heartbeat: {error}")
+
+    def _publish_diagnostics(self) -> None:
+        now = time.monotonic()
+        values: dict[str, str] = {}
+        for name, count in sorted(self.counts.items()):
+            before, since = self._rates.get(name, (0, now))
+            self._rates[name] = (count, now)
+            values[name] = str(count)
+            if now > since:
+                values[f"{name} per second"] = f"{(count - before) / (now - since):.1f}"
+        values |= {f"rejected: {kind}": str(n) for kind, n in self.reasons.most_common()}
+        values["busy seconds"] = f"{self.busy_s:.3f}"
+        values |= {k: str(v) for k, v in self.state_counts().items()}
+        for source in self.sources:
+            values |= {f"{source.stream} {k}": str(v) for k, v in source.counts().items()}
+        waiting = self.waiting()
+        if self.error:
+            level, text = Level.ERROR, self.error
+        elif waiting:
+            level, text = Level.WARN, waiting
+        elif self.counts["rejected"]:
+            level, text = Level.WARN, f"{self.counts['rejected']} rejected"
+        else:
+            level, text = Level.OK, "running" if self.active else "inactive"
+        name = self.get_fully_qualified_name()
+        self._diagnostics.publish(
+            diagnostics_to_msg(self.messages, self.now_ns(), name, self.instance, level, text, values)
+        )
+
+    # Lifecycle
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Make everything; refuse with one line if that cannot be done."""
+        try:
+            self._reports = self.publisher("progress", qos.REPORTS)
+            self._heartbeats = self.publisher("progress", qos.HEARTBEAT)
+            self._diagnostics = self.publisher("/diagnostics", qos.DIAGNOSTICS)
+            self.error = ""
+            self.setup()
+            self.every(1.0, self._publish_diagnostics)
+            self.every(0.2, self._tick)
+        except CsasError as error:
+            self.error = str(error)
+            self.get_logger().error(self.error)
+            self._destroy_owned()
+            return TransitionCallbackReturn.FAILURE
+        return super().on_configure(state)
+
+    def _tick(self) -> None:
+        if self.active:
+            for inlet in self.inlets:
+                inlet.give_up_lonely()
+            self.tick()
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin to work."""
+        self.active = True
+        self._beat_stop.clear()
+        self._beat_thread = threading.Thread(target=self._beat_on, name="heartbeat", daemon=True)
+        self._send_beats()
+        self._beat_thread.start()
+        self.on_activated()
+        for source in self.sources:
+            source.wake()
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop working; sources stop waiting for this node."""
+        self._stop_working()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Drop everything, so that another run can be configured."""
+        self.finish()
+        self._destroy_owned()
+        self.forget()
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Come to an end from whatever state."""
+        self.stop()
+        return super().on_shutdown(state)
+
+    def _stop_working(self) -> None:
+        if not self.active:
+            return
+        self.finish()
+        self._beat_stop.set()
+        with self._beat_lock:
+            self.active = False
+            try:
+                self._send_beats(leaving=True)
+            except (InvalidHandle, RuntimeError) as error:
+                self.get_logger().debug(f"could not say goodbye: {error}")
+        if self._beat_thread is not None:
+            self._beat_thread.join()
+            self._beat_thread = None
+
+    def _destroy_owned(self) -> None:
+        self.inlets.clear()
+        self.sources.clear()
+        while self._owned:
+            destroy, entity = self._owned.pop()
+            destroy(entity)
+
+    def start(self) -> bool:
+        """Configure and activate; False if the node refuses, which is logged."""
+        ok = TransitionCallbackReturn.SUCCESS
+        return self.trigger_configure() == ok and self.trigger_activate() == ok
+
+    def stop(self) -> None:
+        """End the work in an orderly way."""
+        self._stop_working()
+        self.finish()
+        self._destroy_owned()
+
+    def _on_set_parameters(self, changes: list[Parameter]) -> Any:
+        from rcl_interfaces.msg import SetParametersResult
+
+        values = {f: getattr(self.parameters, f) for f in self.parameters.__dataclass_fields__}
+        own = {c.name: c.value for c in changes if c.name in values}
+        try:
+            changed = type(self.parameters).from_mapping(values | own)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self.parameters = changed
+        for source in self.sources:
+            source.apply(changed)
+        return SetParametersResult(successful=True)
+
+
+class Inlet:
+    """A stream of image and camera_info pairs that a node takes.
+
+    Parameters
+    ----------
+    node : CsasNode
+        The node.
+    stream : str
+        Name of the stream.
+    role : str
+        `stage` or `sink`.
+    work : callable
+        Takes (image, camera_info) and returns the outcome to report, or None to report nothing.
+        A `CsasError` that it raises refuses the view.
+    hold : callable, optional
+        Says why no view can be worked on yet; such views wait for `release`, a window of them at most.
+    """
+
+    def __init__(
+        self,
+        node: CsasNode,
+        stream: str,
+        role: str,
+        work: Callable[[Any, Any], str | None],
+        hold: Callable[[], str] | None = None,
+    ) -> None:
+        self.node = node
+        self.stream = stream
+        self.role = role
+        self.instance = f"{node.instance}-{stream}"
+        self.held: deque[tuple[Any, Any]] = deque(maxlen=qos.MAX_WINDOW)
+        self._work = work
+        self._hold = hold or (lambda: "")
+        kind = stream_of(stream)
+        self._pairer = Pairer(kind.image_topic, capacity=qos.MAX_WINDOW)
+        self._last_s = time.monotonic()
+        self._seen: dict[int, None] = {}
+        node.subscribe(kind.image_topic, qos.VIEWS, lambda msg: self._take(msg, is_info=False))
+        node.subscribe(kind.info_topic, qos.VIEWS, lambda msg: self._take(msg, is_info=True))
+        node.inlets.append(self)
+
+    def _take(self, msg: Any, *, is_info: bool) -> None:
+        self._last_s = time.monotonic()
+        pair = self._pairer.add(msg, is_info=is_info)
+        self._report_orphans()
+        if pair is None:
+            return
+        self.node.counts["in"] += 1
+        if self._hold():
+            self.held.append(pair)
+            return
+        self._work_on(*pair)
+
+    def _work_on(self, image: Any, info: Any) -> None:
+        stamp = stamp_to_ns(image.header.stamp)
+        if stamp in self._seen:
+            self.node.counts["duplicates"] += 1
+        try:
+            outcome = self._work(image, info)
+        except CsasError as error:
+            self.node.reject(str(error))
+            self.report(stamp, REJECTED, str(error))
+            return
+        self._seen[stamp] = None
+        if len(self._seen) > 1 << 16:
+            self._seen.pop(next(iter(self._seen)))
+        if outcome is not None:
+            self.report(stamp, outcome)
+
+    def release(self) -> None:
+        """Work on the views that were held."""
+        while self.held and not self._hold():
+            self._work_on(*self.held.popleft())
+
+    def report(self, stamp_ns: int, outcome: str, reason: str = "") -> None:
+        """Tell the sources what became of a view."""
+        self.node.counts["out" if outcome == PUBLISHED else outcome] += outcome != REJECTED
+        level = Level.WARN if outcome == REJECTED else Level.OK
+        values = {"role": self.role, "input": self.stream}
+        self.node.send_report(
+            ViewProgress(stamp_ns, self.node.name, self.instance, outcome, reason, level, values)
+        )
+
+    def _report_orphans(self) -> None:
+        for line in self._pairer.orphans:
+            self.node.reject(line)
+        self._pairer.orphans.clear()
+
+    def give_up_lonely(self) -> None:
+        """Drop messages whose partner has not come while nothing else came either."""
+        if time.monotonic() - self._last_s > _LONELY_S:
+            self._last_s = time.monotonic()
+            self._pairer.flush()
+            self._report_orphans()
+
+    def beat(self, *, leaving: bool) -> Heartbeat:
+        """Make the heartbeat."""
+        values = {"input": self.stream}
+        if leaving:
+            values["leaving"] = "true"
+        if self.node.error:
+            values["error"] = self.node.error
+        counts = self.node.common_counts()
+        return Heartbeat(self.node.now_ns(), self.node.name, self.instance, self.role, counts, values)
+
+
+class Source:
+    """A stream of views that a node sends under flow control.
+
+    Parameters
+    ----------
+    node : CsasNode
+        The node; its parameters are the flow's too.
+    stream : str
+        Name of the stream.
+    make : callable
+        Makes and publishes the view of a stamp. A `CsasError` that it raises takes the view back.
+    may_send : callable, optional
+        Says whether it is time to send that view for the first time.
+    """
+
+    def __init__(
+        self,
+        node: CsasNode,
+        stream: str,
+        make: Callable[[int], None],
+        may_send: Callable[[int], bool] | None = None,
+    ) -> None:
+        p = node.parameters
+        self.node = node
+        self.stream = stream
+        self.instance = f"{node.instance}-source"
+        self.flow = Flow(
+            stream, window=p.window, resend_s=p.resend_s, sink_wait_s=p.sink_wait_s, min_sinks=p.min_sinks
+        )
+        kind = stream_of(stream)
+        self.image = node.publisher(kind.image_topic, qos.VIEWS)
+        self.info = node.publisher(kind.info_topic, qos.VIEWS)
+        self._make = make
+        self._may_send = may_send or (lambda _: True)
+        self._looked_s = 0.0
+        self._guard = node.trigger(self._pump)
+        node.subscribe("progress", qos.REPORTS, self._on_progress)
+        node.every(0.05, self._pump)
+        node.sources.append(self)
+
+    def apply(self, parameters: Any) -> None:
+        """Take changed parameters over."""
+        self.flow.window = parameters.window
+        self.flow.resend_s = parameters.resend_s
+        self.flow.sink_wait_s = parameters.sink_wait_s
+
+    def wake(self) -> None:
+        """Look for work at the next opportunity."""
+        self._guard.trigger()
+
+    def _on_progress(self, msg: Any) -> None:
+        before = self.flow.in_flight
+        self.flow.heard(progress_from_msg(msg))
+        if self.flow.in_flight < before:
+            self.wake()
+
+    def _pump(self) -> None:
+        if not self.node.active:
+            return
+        flow, now = self.flow, time.monotonic()
+        if now - self._looked_s > 0.1:
+            self._looked_s = now
+            flow.look(self.image.get_subscription_count())
+        self._log_notes()
+        fresh = flow.peek()
+        may_send = fresh is None or self._may_send(fresh)
+        stamp = flow.next(fresh=may_send)
+        if stamp is None:
+            if flow.acknowledged_by_transport and flow.in_flight and self._all_acked():
+                flow.transported()
+                self.wake()
+            return
+        try:
+            self._make(stamp)
+            self.node.counts["sent"] += 1
+        except CsasError as error:
+            flow.refuse(stamp, str(error))
+            self.refused(stamp, str(error))
+        self.wake()
+
+    def _all_acked(self) -> bool:
+        instant = Duration(nanoseconds=1_000_000)
+        return bool(self.image.wait_for_all_acked(instant) and self.info.wait_for_all_acked(instant))
+
+    def _log_notes(self) -> None:
+        for level, text in self.flow.notes:
+            if level == "error":
+                self.node.get_logger().error(text)
+            else:
+                self.node.get_logger().warning(text)
+        self.flow.notes.clear()
+
+    def refused(self, stamp_ns: int, reason: str, **values: str) -> None:
+        """Report a view that cannot be made."""
+        self.node.reject(reason)
+        values |= {"role": "source", "input": self.stream}
+        self.node.send_report(
+            ViewProgress(stamp_ns, self.node.name, self.instance, REJECTED, reason, Level.WARN, values)
+        )
+
+    def counts(self) -> dict[str, int]:
+        """Return how far it is."""
+        flow = self.flow
+        return {
+            "total": flow.total,
+            "done": flow.done,
+            "in_flight": flow.in_flight,
+            "resends": flow.resends,
+            "lost": len(flow.lost),
+            "refused": len(flow.refused),
+            "finished": int(flow.finished),
+        }
+
+    def beat(self, *, leaving: bool) -> Heartbeat:
+        """Make the heartbeat: it tells the sinks for whom the run is at its end."""
+        values = {"stream": self.stream}
+        if leaving:
+            values["leaving"] = "true"
+        else:
+            values["finished_for"] = " ".join(self.flow.finished_for())
+            values["waiting_for"] = self.flow.waiting_for()
+        if self.node.error:
+            values["error"] = self.node.error
+        counts = self.node.common_counts() | self.counts()
+        return Heartbeat(self.node.now_ns(), self.node.name, self.instance, "source", counts, values)
+
+
+class ViewOutlet:
+    """A stream of views that a stage publishes.
+
+    Parameters
+    ----------
+    node : CsasNode
+        The node.
+    stream : str
+        Name of the stream.
+    """
+
+    def __init__(self, node: CsasNode, stream: str) -> None:
+        self._node = node
+        self._stream = stream
+        kind = stream_of(stream)
+        self._info = node.publisher(kind.info_topic, qos.VIEWS)
+        self._image = node.publisher(kind.image_topic, qos.VIEWS)
+
+    def send(self, view: View) -> None:
+        """Publish a view; its stamp goes out unchanged."""
+        image, info = view_to_msgs(self._node.messages, view, self._stream)
+        self._info.publish(info)
+        self._image.publish(image)
+
+
+class TargetInlet:
+    """The target: given by parameter, or from topic `target`; never guessed.
+
+    Parameters
+    ----------
+    node : CsasNode
+        The node; its parameters say whether the target is given.
+    on_known : callable
+        Called once it is known that there is a target, or that there is none.
+    """
+
+    def __init__(self, node: CsasNode, on_known: Callable[[], None]) -> None:
+        p = node.parameters
+        self._node = node
+        self._on_known = on_known
+        self.known = p.target == "given"
+        self.target: Target | None = None
+        if self.known:
+            size = getattr(p, "size_m", (0.0, 0.0, 0.0))
+            self.target = Target((p.position_m[0], p.position_m[1]), (size[0], size[1], size[2]))
+        else:
+            node.subscribe_latched("target", self._take)
+
+    def _take(self, msg: Any) -> None:
+        box = target_from_msg(msg)
+        target = self._target_of(box)
+        if not self.known:
+            self.known, self.target = True, target
+            self._on_known()
+        elif self._place(target) != self._place(self.target):
+            self._node.reject(
+                f"target moved to {self._place(target)} from {self._place(self.target)} during the run: the"
+                " first one is kept; clean up and configure again for another run"
+            )
+
+    @staticmethod
+    def _target_of(box: TargetBox | None) -> Target | None:
+        return None if box is None else Target((box.centre_m[0], box.centre_m[1]), box.size_m)
+
+    @staticmethod
+    def _place(target: Target | None) -> object:
+        return None if target is None else (target.position_m, target.size_m)
+
+    def missing(self) -> str:
+        """Say why there is nothing to go by yet; empty once it is known."""
+        return "" if self.known else "no target position: nothing came on topic target, and none is given"
+
+
+def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> int:
+    """Run a node until SIGINT or SIGTERM; the console scripts end up here.
+
+    Returns
+    -------
+    int
+        0; 2 if a parameter is refused or the node cannot be configured.
+    """
+    if "HOME" not in os.environ:
+        # rclpy.init raises where it can find no directory for its log.
+        os.environ.setdefault("ROS_LOG_DIR", os.path.join(tempfile.gettempdir(), "ros_log"))
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # Not rclpy's handlers: they shut the context down before the node can say goodbye.
+        signal.signal(number, lambda *_: stop.set())
+    context = Context()
+    argv = [sys.argv[0], *(sys.argv[1:] if arguments is None else arguments)]
+    rclpy.init(args=argv, context=context, signal_handler_options=SignalHandlerOptions.NO)
+    code = 0
+    try:
+        try:
+            node = kind(context=context)
+        except ParameterError as error:
+            sys.stderr.write(f"{kind.name}: {error}\n")
+            return 2
+        try:
+            if node.parameters.autostart and not node.start():
+                sys.stderr.write(f"{kind.name}: {node.error or 'could not be started'}\n")
+                code = 2
+            else:
+                spin(node, stop)
+        finally:
+            node.stop()
+            node.destroy_node()
+    finally:
+        rclpy.try_shutdown(context=context)
+    return code
+
+
+def spin(node: CsasNode, stop: threading.Event) -> None:
+    """Spin until told to stop; a message that cannot even be taken is counted, not fatal."""
+    parent = os.environ.get("CSAS_PARENT_PID")
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    try:
+        while not stop.is_set() and node.context.ok():
+            try:
+                executor.spin_once(timeout_sec=0.2)
+            except ExternalShutdownException:
+                return
+            except Exception as error:
+                node.fault("message could not be taken", error)
+            if parent and os.getppid() != int(parent):
+                return  # whoever started us is gone without ending us
+    finally:
+        executor.remove_node(node)
+        executor.shutdown(timeout_sec=1.0)
+
+
+__all__ = [
+    "INTEGRATED",
+    "PUBLISHED",
+    "REJECTED",
+    "CsasNode",
+    "Inlet",
+    "Source",
+    "TargetInlet",
+    "ViewOutlet",
+    "run_node",
+    "spin",
+]

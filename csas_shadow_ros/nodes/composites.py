@@ -1,0 +1,95 @@
+"""Node `composites`: multi-look and colour-by-aspect images of the circle (section 2)."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+from csas_shadow_ros.core.composites import Composites
+from csas_shadow_ros.core.geometry import Acoustics
+from msg_adapters import GroundInfo, Heartbeat, ground_picture_to_msgs, view_from_msgs
+from msg_adapters.topics import stream as stream_of
+
+from . import qos
+from .base import INTEGRATED, CsasNode, Inlet, run_node
+from .growing import Growing
+
+_PICTURES = ("multilook", "color_by_aspect")
+
+
+class CompositesNode(CsasNode):
+    """Takes `sub_aperture/*`; publishes `multilook/*` and `color_by_aspect/*`."""
+
+    name = "composites"
+
+    def setup(self) -> None:
+        """Make publishers, then the inlet."""
+        self.forget()
+        self.pictures = {
+            name: (
+                self.publisher(stream_of(name).info_topic, qos.LATCHED),
+                self.publisher(stream_of(name).image_topic, qos.LATCHED),
+            )
+            for name in _PICTURES
+        }
+        self.growing = Growing(self.publish_result, self.wanted, self.parameters.publish_hz)
+        self.inlet = Inlet(self, "sub_aperture", "sink", self.work)
+        self.follow_sources()
+
+    def forget(self) -> None:
+        """Drop the images."""
+        self.composites: Composites | None = None
+        self.acoustics: Acoustics | None = None
+
+    def state_counts(self) -> dict[str, int]:
+        """Return how many views are in, and whether that is all."""
+        held = len(self.composites.stamps) if self.composites else 0
+        complete = hasattr(self, "growing") and self.growing.complete
+        return {"views": held, "complete": int(complete)}
+
+    def work(self, image: Any, info: Any) -> str:
+        """Add one view."""
+        view = view_from_msgs(image, info, "sub_aperture")
+        if self.composites is None:
+            self.composites, self.acoustics = Composites.for_view(view), view.info.acoustics
+        if self.composites.integrate(view):
+            self.growing.changed()
+        return INTEGRATED
+
+    def on_source(self, beat: Heartbeat) -> None:
+        """Finish once the source says that every view is here."""
+        if beat.values.get("stream") == "sub_aperture":
+            self.growing.source_says(self.inlet.instance in beat.values.get("finished_for", "").split())
+
+    def tick(self) -> None:
+        """Publish what has changed."""
+        self.growing.period_s = 1.0 / self.parameters.publish_hz
+        self.growing.tick(time.monotonic())
+
+    def wanted(self) -> bool:
+        """Say whether anybody looks at unfinished images."""
+        return any(image.get_subscription_count() for _, image in self.pictures.values())
+
+    def publish_result(self) -> None:
+        """Publish both images as they are."""
+        if self.composites is None or self.acoustics is None:
+            return
+        ground = GroundInfo(max(self.composites.stamps), self.composites.grid, self.acoustics)
+        pixels = {
+            "multilook": self.composites.multilook(),
+            "color_by_aspect": self.composites.color_by_aspect(self.parameters.dynamic_range_db),
+        }
+        for name, (info_publisher, image_publisher) in self.pictures.items():
+            image, info = ground_picture_to_msgs(self.messages, pixels[name], ground, name)
+            info_publisher.publish(info)
+            image_publisher.publish(image)
+
+
+def main() -> int:
+    """Run the node."""
+    return run_node(CompositesNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

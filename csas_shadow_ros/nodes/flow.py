@@ -1,0 +1,398 @@
+"""Flow control: no view is lost however slow a consumer is, memory is bounded, nothing deadlocks.
+
+The rules are told in ``docs/flow_control.md``. This module holds them without any ROS, so that they
+can be tested with a clock that the test turns.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+
+from csas_shadow_ros.core.errors import check_range
+from msg_adapters.progress import REJECTED, Heartbeat, ViewProgress
+
+#: Place of each stream in the chain; a consumer is fed by every source at or before its place.
+PLACES = {"sub_aperture": 0, "shadow": 1, "likelihood": 2, "shadow_mask": 2}
+#: A consumer that does not say what it takes is taken to stand behind everything.
+_LAST = 99
+#: Key of the reports that the transport makes where no consumer reports anything.
+TRANSPORT = "transport"
+_LONGEST_BACKOFF_S = 20.0
+_FIRST_RESEND_S = 1.0
+
+
+def place_of(stream: str) -> int:
+    """Return a stream's place in the chain."""
+    return PLACES.get(stream, _LAST)
+
+
+@dataclass
+class Peer:
+    """A consumer that reports: what its messages have told of it.
+
+    Parameters
+    ----------
+    instance, node : str
+        The running process' identity, and its node's name.
+    role : str
+        `stage` or `sink`.
+    stream : str
+        What it takes; empty if it does not say.
+    heard_s : float
+        When it was last heard.
+    """
+
+    instance: str
+    node: str
+    role: str
+    stream: str
+    heard_s: float
+    alive: bool = True
+
+    @property
+    def key(self) -> str:
+        """Whose reports count as this peer's.
+
+        A sink's state dies with its process, so only that process' own reports count. A stage has
+        no state: whatever any process of its name has passed on is passed on.
+        """
+        return self.instance if self.role == "sink" else f"stage {self.node}"
+
+
+@dataclass
+class _Sent:
+    at_s: float
+    first_done: int
+    attempts: int = 1
+    overtaken: int = 0
+    serial: int = 0
+    due: bool = False
+
+
+@dataclass
+class Flow:
+    """Decides which view a source sends next, and knows when all are done.
+
+    A view is done when every live last consumer has reported it, or a stage before that consumer
+    has refused it. Last consumers are all sinks, and the stages behind which nobody reports.
+
+    Parameters
+    ----------
+    stream : str
+        What the source sends: a stream of `PLACES`, or ``sector``.
+    window : int
+        Views that may be on their way at once.
+    resend_s : float
+        A view of which nothing is heard is sent again after so long without any progress.
+    peer_timeout_s : float
+        A consumer that is silent for so long is gone.
+    sink_wait_s : float
+        How long a sink that vanished, or any first consumer, is waited for.
+    max_attempts : int
+        A view that vanishes so many times while others get through is lost.
+    min_sinks : int
+        Nothing is sent before so many sinks are there (or `sink_wait_s` is over).
+    clock : callable
+        Seconds; monotonic.
+    """
+
+    stream: str
+    window: int = 4
+    resend_s: float = 5.0
+    peer_timeout_s: float = 3.0
+    sink_wait_s: float = 60.0
+    max_attempts: int = 5
+    min_sinks: int = 0
+    clock: Callable[[], float] = time.monotonic
+    #: Lines to log, (level, text); the node takes them.
+    notes: list[tuple[str, str]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        check_range("window", self.window, 1, 64)
+        self.peers: dict[str, Peer] = {}
+        self.lost: dict[int, str] = {}
+        self.resends = 0
+        self._stamps: dict[int, None] = {}
+        self._refused: dict[int, str] = {}
+        self._reports: dict[str, set[int]] = {}
+        self._rejected_at: dict[int, set[int]] = {}
+        self._in_flight: dict[int, _Sent] = {}
+        self._missing: dict[int, None] = {}
+        self._gone: dict[tuple[str, str], float] = {}
+        self._leaves: list[Peer] = []
+        self._known_leaves: frozenset[str] = frozenset()
+        self._done_count = 0
+        self._serial = 0
+        self._progress_s = self._born_s = self._served_s = self._looked_s = self.clock()
+        self._subscribers = 0
+        self._told_wait = ""
+
+    # What the source has
+
+    def offer(self, stamps: Iterable[int]) -> None:
+        """Add views that the source can make at any time, in the order in which to send them."""
+        for stamp in stamps:
+            self._stamps.setdefault(stamp)
+        self._recount()
+
+    def refuse(self, stamp: int, reason: str) -> None:
+        """Take a view back that the source cannot make after all."""
+        self._refused[stamp] = reason
+        self._in_flight.pop(stamp, None)
+        self._missing.pop(stamp, None)
+
+    # What consumers say
+
+    def heard(self, item: ViewProgress | Heartbeat) -> None:
+        """Take a report or a heartbeat of a consumer."""
+        role = item.role if isinstance(item, Heartbeat) else item.values.get("role", "stage")
+        if role == "source":
+            return
+        now = self.clock()
+        stream = item.values.get("input", "")
+        if not self._feeds(stream):
+            return
+        leaving = item.values.get("leaving") == "true"
+        peer = self.peers.get(item.instance)
+        if peer is None:
+            peer = self.peers[item.instance] = Peer(item.instance, item.node, role, stream, now, not leaving)
+            if not leaving:
+                self._arrived(peer)
+        elif not peer.alive and not leaving:
+            peer.alive = True
+            self._arrived(peer)
+        peer.heard_s = now
+        if isinstance(item, ViewProgress):
+            self._reported(peer, item)
+        if leaving:
+            # Gone on purpose: nobody waits for it.
+            peer.alive = False
+            self._gone.pop((peer.node, peer.stream), None)
+
+    def _feeds(self, stream: str) -> bool:
+        if self.stream == "sector" or stream == "sector":
+            return stream == self.stream
+        return not stream or place_of(stream) >= place_of(self.stream)
+
+    def _arrived(self, peer: Peer) -> None:
+        self._gone.pop((peer.node, peer.stream), None)
+        if peer.role == "sink":
+            # A process of this name before it died: its reports will never be asked for again.
+            for other in list(self.peers.values()):
+                twin = (other.node, other.stream) == (peer.node, peer.stream)
+                if twin and other is not peer and not other.alive:
+                    del self.peers[other.instance]
+                    self._reports.pop(other.key, None)
+        self.lost.clear()
+        # What was on its way while the consumer was not there may never have reached it.
+        for sent in self._in_flight.values():
+            sent.due, sent.attempts = True, 1
+        self._progress_s = self.clock()
+
+    def _reported(self, peer: Peer, item: ViewProgress) -> None:
+        stamp = item.stamp_ns
+        reports = self._reports.setdefault(peer.key, set())
+        fresh = stamp not in reports
+        reports.add(stamp)
+        if item.outcome == REJECTED and peer.role == "stage":
+            self._rejected_at.setdefault(place_of(peer.stream), set()).add(stamp)
+        if fresh:
+            self._progress_s = self.clock()
+        if stamp in self._in_flight and self._is_done(stamp):
+            self._retire(stamp)
+        elif stamp in self._missing and self._is_done(stamp):
+            del self._missing[stamp]
+
+    def transported(self) -> None:
+        """Say that the transport has delivered everything on its way (used where nobody reports)."""
+        for stamp in list(self._in_flight):
+            self._reports.setdefault(TRANSPORT, set()).add(stamp)
+            if self._is_done(stamp):
+                self._retire(stamp)
+
+    def _retire(self, stamp: int) -> None:
+        sent = self._in_flight.pop(stamp)
+        self._missing.pop(stamp, None)
+        self._done_count += 1
+        self._progress_s = self.clock()
+        for other in self._in_flight.values():
+            if other.serial < sent.serial:
+                other.overtaken += 1
+
+    # Who must have what
+
+    def live(self) -> list[Peer]:
+        """Return the consumers that are there."""
+        return [p for p in self.peers.values() if p.alive]
+
+    def sinks(self) -> list[Peer]:
+        """Return the sinks that are there."""
+        return [p for p in self.live() if p.role == "sink"]
+
+    def _is_done(self, stamp: int) -> bool:
+        if not self._leaves:
+            return stamp in self._reports.get(TRANSPORT, ())
+        for leaf in self._leaves:
+            if stamp in self._reports.get(leaf.key, ()):
+                continue
+            place = place_of(leaf.stream)
+            if not any(at < place and stamp in stamps for at, stamps in self._rejected_at.items()):
+                return False
+        return True
+
+    def _recount(self) -> None:
+        out = self._refused
+        self._missing = {s: None for s in self._stamps if s not in out and not self._is_done(s)}
+        for stamp in [s for s in self._in_flight if s not in self._missing]:
+            self._retire(stamp)
+
+    def look(self, subscribers: int = 1) -> None:
+        """Notice who has come and gone; call it a few times a second.
+
+        Parameters
+        ----------
+        subscribers : int
+            How many subscriptions the source's image topic has, reporting or not.
+        """
+        now = self.clock()
+        deaf_s, self._looked_s = now - self._looked_s, now
+        if deaf_s > 1.0:
+            # The source itself was busy: what the others said meanwhile is still in its queue.
+            for peer in self.peers.values():
+                peer.heard_s += deaf_s
+        for peer in self.peers.values():
+            if peer.alive and now - peer.heard_s > self.peer_timeout_s:
+                peer.alive = False
+                if peer.role == "sink" and not self._twin_alive(peer):
+                    self._gone[peer.node, peer.stream] = now
+                    self.notes.append(
+                        ("warn", f"{peer.node} has been silent for {self.peer_timeout_s:g} s: waiting for it")
+                    )
+        for key, since in list(self._gone.items()):
+            if now - since > self.sink_wait_s:
+                del self._gone[key]
+                self.notes.append(("warn", f"{key[0]} did not come back in {self.sink_wait_s:g} s; going on"))
+        self._subscribers = subscribers
+        live = self.live()
+        takers = {place_of(p.stream) for p in live}
+        # A stage is last if nobody behind it reports: it stands for the unknown that follows it.
+        leaves = [p for p in live if p.role == "sink" or place_of(p.stream) + 1 not in takers]
+        self._leaves = [p for p in leaves if p.role == "sink" or p.stream]
+        keys = frozenset(p.key for p in self._leaves)
+        if live or subscribers:
+            self._served_s = now
+        if keys != self._known_leaves:
+            self._known_leaves = keys
+            self._recount()
+
+    def _twin_alive(self, peer: Peer) -> bool:
+        name = (peer.node, peer.stream)
+        return any(p is not peer and p.alive and (p.node, p.stream) == name for p in self.peers.values())
+
+    # What to send
+
+    @property
+    def acknowledged_by_transport(self) -> bool:
+        """True where nobody reports: then the node calls `transported` when all is delivered."""
+        return not self._leaves and self._subscribers > 0
+
+    def waiting_for(self) -> str:
+        """Say what the source waits for before it sends anything; empty if for nothing."""
+        now = self.clock()
+        if self._gone and not self.sinks():
+            return f"{', '.join(sorted(n for n, _ in self._gone))} to come back"
+        if now - self._born_s < self.sink_wait_s and len(self.sinks()) < self.min_sinks:
+            return f"{self.min_sinks} sinks ({len(self.sinks())} are there)"
+        if not self._leaves and not self._subscribers and now - self._served_s < self.sink_wait_s:
+            return "a consumer"
+        return ""
+
+    def next(self, *, fresh: bool = True) -> int | None:
+        """Return the stamp of the view to send now, None if none is to be sent; it counts as sent.
+
+        Parameters
+        ----------
+        fresh : bool
+            Whether a view may be sent for the first time; False: only again.
+        """
+        if self.waiting_for() or (not self._leaves and not self._subscribers):
+            return None
+        now = self.clock()
+        for stamp, sent in self._in_flight.items():
+            if not self._is_due(sent, now):
+                continue
+            if sent.attempts >= self.max_attempts and self._done_count > sent.first_done:
+                reason = f"sent {sent.attempts} times, never reported though others were"
+                self.lost[stamp] = reason
+                self.notes.append(("error", f"view {stamp} ns is lost: {reason}"))
+                del self._in_flight[stamp]
+                self._missing.pop(stamp, None)
+                return self.next(fresh=fresh)
+            self._serial += 1
+            self.resends += 1
+            sent.attempts += 1
+            sent.at_s, sent.serial, sent.overtaken, sent.due = now, self._serial, 0, False
+            return stamp
+        if not fresh or len(self._in_flight) >= self.window:
+            return None
+        for stamp in self._missing:
+            if stamp not in self._in_flight and stamp not in self.lost:
+                self._serial += 1
+                self._in_flight[stamp] = _Sent(now, self._done_count, serial=self._serial)
+                return stamp
+        return None
+
+    def peek(self) -> int | None:
+        """Return the view that `next` would send for the first time, without sending it."""
+        return next((s for s in self._missing if s not in self._in_flight and s not in self.lost), None)
+
+    def _is_due(self, sent: _Sent, now: float) -> bool:
+        if sent.due or sent.overtaken >= 2 * self.window:
+            return True
+        if self.acknowledged_by_transport:
+            return False
+        # Later attempts wait longer: a slow consumer must not drown in copies. While others get through
+        # the view may merely be queued, so the time runs from the last progress of any view.
+        # Before anything got through, links of the graph may just not have found each other yet.
+        first = self.resend_s if self._done_count else min(self.resend_s, _FIRST_RESEND_S)
+        patience = min(first * 2.0 ** (sent.attempts - 1), max(_LONGEST_BACKOFF_S, self.resend_s))
+        return now - max(sent.at_s, self._progress_s) > patience
+
+    # How far it is
+
+    @property
+    def total(self) -> int:
+        """Views that the source has."""
+        return len(self._stamps)
+
+    @property
+    def in_flight(self) -> int:
+        """Views on their way."""
+        return len(self._in_flight)
+
+    @property
+    def refused(self) -> dict[int, str]:
+        """Views that the source could not make after all, and why."""
+        return self._refused
+
+    @property
+    def done(self) -> int:
+        """Views that need not be sent (again) to anybody who is there."""
+        return self.total - len(self._missing)
+
+    @property
+    def finished(self) -> bool:
+        """Whether there is nothing left to do for anybody who is there or waited for."""
+        if not self._stamps or self._gone or self._in_flight:
+            return False
+        if self.waiting_for():
+            return False
+        nobody = not self._leaves and not self._subscribers
+        return nobody or all(s in self.lost for s in self._missing)
+
+    def finished_for(self) -> Iterator[str]:
+        """Iterate the instances of the consumers that have, or will never have, every view."""
+        if self.finished:
+            yield from (p.instance for p in self._leaves)

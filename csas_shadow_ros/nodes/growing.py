@@ -1,0 +1,62 @@
+"""When to publish a result that grows with every view."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+#: Without a source that tells the end, a result that has not changed for so long is shown as it is.
+IDLE_S = 2.0
+_SOURCE_TIMEOUT_S = 3.0
+
+
+class Growing:
+    """Publishes a growing result now and then while somebody looks, and once more when it is complete.
+
+    Parameters
+    ----------
+    publish : callable
+        Publishes the result as it is.
+    wanted : callable
+        Says whether anybody looks.
+    hz : float
+        Most often; less where publishing takes more than a tenth of the time.
+    """
+
+    def __init__(self, publish: Callable[[], None], wanted: Callable[[], bool], hz: float) -> None:
+        self._publish = publish
+        self._wanted = wanted
+        self.period_s = 1.0 / hz
+        #: Whether all views are in and the result is published.
+        self.complete = False
+        self._dirty = False
+        self._ended = False
+        self._published_s = self._changed_s = -1e9
+        self._source_s = -1e9
+        self._cost_s = 0.0
+
+    def changed(self) -> None:
+        """Say that the result has changed."""
+        self._dirty, self.complete, self._changed_s = True, False, time.monotonic()
+
+    def source_says(self, ended: bool) -> None:
+        """Take a source's word whether every view has come."""
+        self._source_s, self._ended = time.monotonic(), ended
+
+    def tick(self, now: float) -> None:
+        """Publish if it is time to."""
+        if self._ended and not self.complete:
+            # Also where nothing came at all: that is a result too.
+            self._do(now)
+            self.complete = True
+        elif self._dirty:
+            settled = now - self._source_s > _SOURCE_TIMEOUT_S and now - self._changed_s > IDLE_S
+            due = now - self._published_s > max(self.period_s, 10.0 * self._cost_s)
+            if settled or (due and self._wanted()):
+                self._do(now)
+
+    def _do(self, now: float) -> None:
+        self._dirty = False
+        self._publish()
+        self._published_s = time.monotonic()
+        self._cost_s = self._published_s - now

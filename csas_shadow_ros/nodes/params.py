@@ -1,0 +1,309 @@
+"""Parameters of the nodes: the core's dataclasses, plus what only a node needs.
+
+One dataclass a node drives its ROS parameter descriptors, ``config/csas_shadow.yaml`` and the README's
+table; a test holds the three together. ``python -m csas_shadow_ros.nodes.params`` prints the table,
+with ``--yaml`` the YAML file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from csas_shadow_ros.core.errors import ParameterError
+from csas_shadow_ros.core.parameters import (
+    CarvingParameters,
+    LikelihoodParameters,
+    Parameters,
+    ShadowParameters,
+    SubApertureParameters,
+    TargetParameters,
+    bounded,
+)
+
+P = TypeVar("P", bound=Parameters)
+
+
+@dataclass(frozen=True)
+class NodeParameters(Parameters):
+    """What every node takes."""
+
+    autostart: bool = bounded(True, "configure and activate at once; false: wait for a lifecycle manager")
+
+
+@dataclass(frozen=True)
+class FlowParameters(Parameters):
+    """What every source of views takes."""
+
+    window: int = bounded(4, "views that may be on their way at once", low=1, high=8)
+    resend_s: float = bounded(
+        5.0, "a view of which nothing is heard is sent again after", low=0.1, high=600.0, unit="s"
+    )
+    sink_wait_s: float = bounded(
+        60.0, "how long a consumer that is not there is waited for", low=0.0, high=86400.0, unit="s"
+    )
+    min_sinks: int = bounded(0, "no view is sent before so many sinks are there", low=0, high=16)
+
+
+@dataclass(frozen=True)
+class SnapshotParameters(Parameters):
+    """What nodes take that show their result while it grows."""
+
+    publish_hz: float = bounded(
+        1.0, "most often that an unfinished result is published", low=0.01, high=20.0, unit="Hz"
+    )
+
+
+@dataclass(frozen=True)
+class FocusParameters(Parameters):
+    """Where shadows are focused."""
+
+    target: str = bounded("auto", "auto: from topic target; given: at position_m", choices=("auto", "given"))
+    position_m: tuple[float, ...] = bounded(
+        (0.0, 0.0), "x, y of the target when given", low=-1e6, high=1e6, unit="m", length=2
+    )
+
+
+@dataclass(frozen=True)
+class BoxParameters(Parameters):
+    """Where the target is and how large it is, for nodes behind the one that finds it."""
+
+    target: str = bounded(
+        "auto", "auto: from topic target; given: position_m and size_m", choices=("auto", "given")
+    )
+    position_m: tuple[float, ...] = bounded(
+        (0.0, 0.0), "x, y of the target when given", low=-1e6, high=1e6, unit="m", length=2
+    )
+    size_m: tuple[float, ...] = bounded(
+        (0.0, 0.0, 0.0), "x, y, z size of the carved volume when given", low=0.0, high=1e5, unit="m", length=3
+    )
+
+
+@dataclass(frozen=True)
+class SubApertureNodeParameters(NodeParameters, FlowParameters, TargetParameters, SubApertureParameters):
+    """Parameters of `sub_aperture`."""
+
+
+@dataclass(frozen=True)
+class ShadowEnhancementNodeParameters(NodeParameters, FocusParameters, ShadowParameters):
+    """Parameters of `shadow_enhancement`."""
+
+
+@dataclass(frozen=True)
+class ShadowLikelihoodNodeParameters(NodeParameters, BoxParameters, LikelihoodParameters):
+    """Parameters of `shadow_likelihood`."""
+
+
+@dataclass(frozen=True)
+class VoxelCarverNodeParameters(NodeParameters, SnapshotParameters, BoxParameters, CarvingParameters):
+    """Parameters of `voxel_carver`."""
+
+
+@dataclass(frozen=True)
+class CompositesNodeParameters(NodeParameters, SnapshotParameters):
+    """Parameters of `composites`."""
+
+    dynamic_range_db: float = bounded(
+        35.0, "levels shown in colour by aspect", low=1.0, high=200.0, unit="dB"
+    )
+
+
+@dataclass(frozen=True)
+class BagPlayerNodeParameters(NodeParameters, FlowParameters):
+    """Parameters of `bag_player`."""
+
+    bag: str = bounded("", "bag to play: a rosbag2 directory, or an .mcap or .db3 file")
+    stage: str = bounded(
+        "auto",
+        "what to play; auto: the earliest that the bag holds whole",
+        choices=("auto", "image", "sector", "sub_aperture", "shadow", "likelihood", "shadow_mask"),
+    )
+    rate: float = bounded(
+        1.0, "views: times the recorded speed; 0: as fast as they are taken", low=0.0, high=1e6
+    )
+
+
+@dataclass(frozen=True)
+class BagRecorderNodeParameters(NodeParameters):
+    """Parameters of `bag_recorder`."""
+
+    out: str = bounded("", "bag to make: a directory that does not exist yet")
+    compress: bool = bounded(True, "compress with zstd")
+    topics: str = bounded("all", "topics to record, relative, separated by commas; all: the whole contract")
+
+
+#: The parameters of each node.
+NODES: dict[str, type[Parameters]] = {
+    "sub_aperture": SubApertureNodeParameters,
+    "shadow_enhancement": ShadowEnhancementNodeParameters,
+    "shadow_likelihood": ShadowLikelihoodNodeParameters,
+    "voxel_carver": VoxelCarverNodeParameters,
+    "composites": CompositesNodeParameters,
+    "bag_player": BagPlayerNodeParameters,
+    "bag_recorder": BagRecorderNodeParameters,
+}
+
+#: Parameters that may change while the node runs. A change of any other would mix two results in one.
+DYNAMIC = frozenset({"window", "resend_s", "sink_wait_s", "publish_hz", "dynamic_range_db", "rate"})
+
+#: Overrides that belong to rclpy itself.
+_OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+
+
+def part(parameters: Parameters, kind: type[P]) -> P:
+    """Return the part of a node's parameters that a function of the core takes."""
+    return kind(**{f.name: getattr(parameters, f.name) for f in dataclasses.fields(kind)})
+
+
+def from_overrides(kind: type[P], overrides: Mapping[str, Any]) -> P:
+    """Make a node's parameters from what the command line or a file gives.
+
+    Raises
+    ------
+    ParameterError
+        If a name is unknown or a value out of range.
+    """
+    return kind.from_mapping({k: v for k, v in overrides.items() if not k.startswith(_OF_RCLPY)})
+
+
+def expected_of(field: dataclasses.Field[Any]) -> str:
+    """Say which values a field takes."""
+    meta = field.metadata
+    if meta["choices"]:
+        return ", ".join(meta["choices"])
+    if isinstance(field.default, bool):
+        return "true, false"
+    if meta["low"] is None:
+        return "text"
+    each = " each" if meta["length"] else ""
+    return f"{meta['low']:g} to {meta['high']:g}{each}"
+
+
+def description_of(field: dataclasses.Field[Any]) -> str:
+    """Return a field's description with its unit."""
+    unit = field.metadata["unit"]
+    return str(field.metadata["doc"]) + (f" [{unit}]" if unit else "")
+
+
+def declare(node: Any, parameters: Parameters) -> None:
+    """Declare a node's parameters with descriptors that say their bounds.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        The node.
+    parameters : Parameters
+        Checked values; overrides have been taken into account already.
+    """
+    from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+
+    for field in dataclasses.fields(parameters):
+        meta = field.metadata
+        descriptor = ParameterDescriptor(
+            name=field.name,
+            description=description_of(field),
+            additional_constraints=expected_of(field),
+            read_only=field.name not in DYNAMIC,
+        )
+        if isinstance(field.default, float):
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(meta["low"]), to_value=float(meta["high"]), step=0.0)
+            ]
+        elif isinstance(field.default, int) and not isinstance(field.default, bool):
+            descriptor.integer_range = [
+                IntegerRange(from_value=int(meta["low"]), to_value=int(meta["high"]), step=1)
+            ]
+        value = getattr(parameters, field.name)
+        if isinstance(value, tuple):
+            value = list(value)
+        node.declare_parameter(field.name, value, descriptor, ignore_override=True)
+
+
+def _yaml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, tuple):
+        return f"[{', '.join(_yaml_value(v) for v in value)}]"
+    if isinstance(value, float):
+        # rcl reads a number without a point as an integer, and YAML 1.1 reads 1e-05 as a text.
+        text = repr(value)
+        return text if "." in text else text.replace("e", ".0e")
+    return str(value)
+
+
+def yaml_text(values: Mapping[str, Mapping[str, Any]] | None = None, *, only_given: bool = False) -> str:
+    """Write parameters as a ROS parameter file.
+
+    Parameters
+    ----------
+    values : mapping of node name to mapping of parameter name to value
+        Values that differ from the defaults.
+    only_given : bool
+        Write these alone, without comments.
+    """
+    given = values or {}
+    lines = []
+    if not only_given:
+        lines += [
+            "# Parameters of all nodes, with their defaults. Written by",
+            "# python -m csas_shadow_ros.nodes.params --yaml; a test compares. Nodes refuse unknown names.",
+        ]
+    for name, kind in NODES.items():
+        own = given.get(name, {})
+        if only_given and not own:
+            continue
+        lines += [f"/**/{name}:", "  ros__parameters:"]
+        parameters = kind.from_mapping(own)
+        for field in dataclasses.fields(parameters):
+            if only_given and field.name not in own:
+                continue
+            note = "" if only_given else f"  # {description_of(field)} ({expected_of(field)})"
+            lines.append(f"    {field.name}: {_yaml_value(getattr(parameters, field.name))}{note}")
+    return "\n".join(lines) + "\n"
+
+
+def parameter_table() -> str:
+    """Write all nodes' parameters as markdown tables, for the README."""
+    lines = []
+    for name, kind in NODES.items():
+        lines += [f"**{name}**", "", "| parameter | default | range | meaning |", "|---|---|---|---|"]
+        for field in dataclasses.fields(kind):
+            default = _yaml_value(field.default).replace('""', '"" (must be given)')
+            lines.append(
+                f"| `{field.name}` | {default} | {expected_of(field)} | {description_of(field)} |"
+            )
+        lines.append("")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def check(values: Mapping[str, Mapping[str, Any]]) -> None:
+    """Check parameters of several nodes at once.
+
+    Raises
+    ------
+    ParameterError
+        If a node, a name or a value is not known or out of range.
+    """
+    for name, own in values.items():
+        if name not in NODES:
+            raise ParameterError(f"unknown node {name!r}; expected one of: {', '.join(NODES)}")
+        try:
+            NODES[name].from_mapping(own)
+        except ParameterError as error:
+            raise ParameterError(f"{name}: {error}") from error
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table, or the YAML file with ``--yaml``."""
+    chosen = sys.argv[1:] if arguments is None else list(arguments)
+    sys.stdout.write(yaml_text() if "--yaml" in chosen else parameter_table())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

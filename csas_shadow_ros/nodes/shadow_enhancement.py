@@ -1,0 +1,48 @@
+"""Node `shadow_enhancement`: focuses the shadows of every sub-aperture view (section 3.2)."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from csas_shadow_ros.core.errors import NoTargetError
+from csas_shadow_ros.core.parameters import ShadowParameters
+from csas_shadow_ros.core.shadow import enhance
+from msg_adapters import view_from_msgs
+
+from .base import PUBLISHED, CsasNode, Inlet, TargetInlet, ViewOutlet, run_node
+from .params import part
+
+
+class ShadowEnhancementNode(CsasNode):
+    """Takes `sub_aperture/*`, publishes `shadow/*`."""
+
+    name = "shadow_enhancement"
+
+    def setup(self) -> None:
+        """Make the outlet before the inlet: what comes in can go out."""
+        self.shadow = ViewOutlet(self, "shadow")
+        self.target = TargetInlet(self, lambda: self.inlet.release())
+        self.inlet = Inlet(self, "sub_aperture", "stage", self.work, hold=self.target.missing)
+
+    def waiting(self) -> str:
+        """Say so if views wait for the target."""
+        return self.target.missing() if self.inlet.held else ""
+
+    def work(self, image: Any, info: Any) -> str:
+        """Enhance one view."""
+        view = view_from_msgs(image, info, "sub_aperture")
+        if self.target.target is None:
+            raise NoTargetError("no target: topic target says that there is no object in the scene")
+        p = part(self.parameters, ShadowParameters)
+        self.shadow.send(enhance(view, self.target.target.position_m, p))
+        return PUBLISHED
+
+
+def main() -> int:
+    """Run the node."""
+    return run_node(ShadowEnhancementNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

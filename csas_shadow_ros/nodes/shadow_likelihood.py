@@ -1,0 +1,67 @@
+"""Node `shadow_likelihood`: how likely pixels lie outside the shadow, and the silhouette (section 4)."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from csas_shadow_ros.core.likelihood import outside_likelihood, view_levels
+from csas_shadow_ros.core.parameters import LikelihoodParameters
+from csas_shadow_ros.core.segmentation import segment_shadow
+from msg_adapters import view_from_msgs
+
+from .base import PUBLISHED, CsasNode, Inlet, TargetInlet, ViewOutlet, run_node
+from .params import part
+
+
+class ShadowLikelihoodNode(CsasNode):
+    """Takes `shadow/*`, publishes `likelihood/*`, and `shadow_mask/*` once there is a target.
+
+    The likelihood needs no target. The mask does, so its publisher exists only from when the target
+    is known: a recorder does not wait for masks that nobody can make.
+    """
+
+    name = "shadow_likelihood"
+
+    def setup(self) -> None:
+        """Make the outlets before the inlet."""
+        self.likelihood = ViewOutlet(self, "likelihood")
+        self.mask: ViewOutlet | None = None
+        self.target = TargetInlet(self, self._open_mask)
+        if self.target.known:
+            self._open_mask()
+        self.inlet = Inlet(self, "shadow", "stage", self.work)
+
+    def _open_mask(self) -> None:
+        if self.target.target is not None and self.mask is None:
+            self.mask = ViewOutlet(self, "shadow_mask")
+
+    def forget(self) -> None:
+        """Drop the mask's publisher."""
+        self.mask = None
+
+    def waiting(self) -> str:
+        """Say so if no masks can be made."""
+        missing = self.target.missing()
+        return f"{missing}; likelihood only, no masks" if missing and self.counts["in"] else ""
+
+    def work(self, image: Any, info: Any) -> str:
+        """Make the likelihood, and the mask, of one view."""
+        view = view_from_msgs(image, info, "shadow")
+        p = part(self.parameters, LikelihoodParameters)
+        levels = view_levels(view, p)
+        # The mask goes first: once the likelihood is in the grid the view may count as done.
+        target = self.target.target
+        if self.mask is not None and target is not None:
+            self.mask.send(segment_shadow(view, target.position_m, p, levels, reach_m=target.reach_m))
+        self.likelihood.send(outside_likelihood(view, p, levels))
+        return PUBLISHED
+
+
+def main() -> int:
+    """Run the node."""
+    return run_node(ShadowLikelihoodNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,106 @@
+"""Node `voxel_carver`: carves the voxel grid, and publishes it, its voxels and its mesh (section 4)."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+from csas_shadow_ros.core.carving import Carver
+from csas_shadow_ros.core.errors import NoTargetError, ParameterError
+from csas_shadow_ros.core.mesh import mesh_from_grid
+from csas_shadow_ros.core.parameters import CarvingParameters
+from csas_shadow_ros.core.segmentation import require_silhouette
+from csas_shadow_ros.core.volume import Volume
+from msg_adapters import Heartbeat, mesh_to_msg, view_from_msgs, voxel_grid_to_msgs, voxels_to_msg
+
+from . import qos
+from .base import INTEGRATED, CsasNode, Inlet, TargetInlet, run_node
+from .growing import Growing
+from .params import part
+
+
+class VoxelCarverNode(CsasNode):
+    """Takes `likelihood/*` (soft) or `shadow_mask/*` (hard); publishes `voxel_grid/*`, `voxels`, `mesh`."""
+
+    name = "voxel_carver"
+
+    def setup(self) -> None:
+        """Make publishers, then the inlet of the method's stream."""
+        p = self.parameters
+        if p.target == "given" and not all(s > 0 for s in p.size_m):
+            raise ParameterError(f"size_m is {list(p.size_m)}; expected x, y, z > 0 m with a given target")
+        self.forget()
+        self.grid_image = self.publisher("voxel_grid/image", qos.LATCHED)
+        self.grid_info = self.publisher("voxel_grid/camera_info", qos.LATCHED)
+        self.voxels = self.publisher("voxels", qos.LATCHED)
+        self.mesh = self.publisher("mesh", qos.LATCHED)
+        self.stream = "likelihood" if p.method == "soft" else "shadow_mask"
+        self.target = TargetInlet(self, lambda: self.inlet.release())
+        self.inlet = Inlet(self, self.stream, "sink", self.work, hold=self.target.missing)
+        self.growing = Growing(self.publish_result, self.wanted, p.publish_hz)
+        self.follow_sources()
+
+    def forget(self) -> None:
+        """Drop the grid."""
+        self.carver: Carver | None = None
+
+    def waiting(self) -> str:
+        """Say so if views wait for the target."""
+        return self.target.missing() if self.inlet.held else ""
+
+    def state_counts(self) -> dict[str, int]:
+        """Return how many views the grid holds, and whether that is all."""
+        held = len(self.carver.stamps) if self.carver else 0
+        complete = hasattr(self, "growing") and self.growing.complete
+        return {"views": held, "complete": int(complete)}
+
+    def work(self, image: Any, info: Any) -> str:
+        """Integrate one view; one that is in already changes nothing."""
+        view = view_from_msgs(image, info, self.stream)
+        target = self.target.target
+        if target is None:
+            raise NoTargetError("no target: topic target says that there is no object in the scene")
+        if self.carver is None:
+            p = part(self.parameters, CarvingParameters)
+            self.carver = Carver(Volume.around(target.position_m, target.size_m, p.voxel_size_m), p)
+        if self.carver.integrate(require_silhouette(view) if self.stream == "shadow_mask" else view):
+            self.growing.changed()
+        return INTEGRATED
+
+    def on_source(self, beat: Heartbeat) -> None:
+        """Finish once a source says that every view is here."""
+        if beat.values.get("stream") != "sector":
+            self.growing.source_says(self.inlet.instance in beat.values.get("finished_for", "").split())
+
+    def tick(self) -> None:
+        """Publish what has changed."""
+        self.growing.period_s = 1.0 / self.parameters.publish_hz
+        self.growing.tick(time.monotonic())
+
+    def wanted(self) -> bool:
+        """Say whether anybody looks at unfinished results."""
+        return any(p.get_subscription_count() for p in (self.grid_image, self.voxels, self.mesh))
+
+    def publish_result(self) -> None:
+        """Publish grid, voxels and mesh as they are."""
+        if self.carver is None:
+            # Nothing came: no object as far as anybody knows.
+            self.mesh.publish(mesh_to_msg(self.messages, None, self.now_ns()))
+            return
+        grid, stamp = self.carver.grid(), max(self.carver.stamps)
+        image, info = voxel_grid_to_msgs(self.messages, grid.volume, grid.likelihood, stamp)
+        self.grid_info.publish(info)
+        self.grid_image.publish(image)
+        self.voxels.publish(voxels_to_msg(self.messages, grid, stamp))
+        mesh = mesh_from_grid(grid) if grid.occupied.any() else None
+        self.mesh.publish(mesh_to_msg(self.messages, mesh, stamp))
+
+
+def main() -> int:
+    """Run the node."""
+    return run_node(VoxelCarverNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
