@@ -6,6 +6,7 @@ import math
 from functools import lru_cache
 
 import numpy as np
+from scipy.signal.windows import tukey
 
 from csas_shadow_ros.core import reference
 from csas_shadow_ros.core.geometry import (
@@ -85,9 +86,23 @@ REFERENCE_FACTOR = 4
 
 
 @lru_cache(maxsize=4)
-def sub_apertures(sign=1, aperture_deg=12.0):
+def faded_image(sign=1):
+    """Return the band-limited noise, faded out towards the image's borders: no edge that would diffract."""
+    image = band_limited_image(sign)
+    grid = image.grid
+    low, _, high = acoustics(sign).ground_band(nominal_grazing())
+    k = np.hypot(*wavenumber_lattice(grid))
+    # Narrower than the band by what the fading spreads.
+    core = np.fft.ifft2(np.fft.fft2(image.pixels) * ((k > low + 25) & (k < high - 25)))
+    window = np.outer(tukey(grid.rows, 0.5), tukey(grid.cols, 0.5))
+    return CoherentImage((core * window).astype(np.complex64), grid, acoustics(sign), 7)
+
+
+@lru_cache(maxsize=8)
+def sub_apertures(sign=1, aperture_deg=12.0, faded=False):
     parameters = SubApertureParameters(aperture_deg=aperture_deg, spacing_m=REFERENCE_FACTOR * SPACING_M)
-    return SubApertures(band_limited_image(sign), circle_track(), parameters)
+    image = faded_image(sign) if faded else band_limited_image(sign)
+    return SubApertures(image, circle_track(), parameters)
 
 
 def fine_camera(camera):
@@ -98,10 +113,10 @@ def fine_camera(camera):
 
 
 @lru_cache(maxsize=32)
-def view_and_reference(sign, aspect_deg, aperture_deg=12.0):
+def view_and_reference(sign, aspect_deg, aperture_deg=12.0, faded=False):
     """Return a fast view and the literal full-size one (in the view frame, on its carrier, finely sampled)."""
-    image, aspect = band_limited_image(sign), math.radians(aspect_deg)
-    view = sub_apertures(sign, aperture_deg).view_of_aspect(aspect)
+    image, aspect = faded_image(sign) if faded else band_limited_image(sign), math.radians(aspect_deg)
+    view = sub_apertures(sign, aperture_deg, faded).view_of_aspect(aspect)
     camera = fine_camera(view.info.camera)
     full = reference.sub_aperture(image, aspect, math.radians(aperture_deg))
     return view, reference.rotate_to_view(full, image, camera, aspect), camera
