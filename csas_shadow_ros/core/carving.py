@@ -2,10 +2,11 @@
 
 A voxel projects to the seabed pixel where its shadow would fall; P · X does it for every view. Soft
 carving averages l_out there over the views. Hard carving removes a voxel as soon as it falls outside
-one view's segmented shadow.
+one view's segmented shadow. Consensus carving, the default, removes it when a few per cent of the
+views agree that it does: one bad silhouette then does no harm.
 
-Both accumulate whole numbers, so that the grid does not depend on the order in which views arrive,
-and both remember the stamps they hold, so that a view counts once however often it is sent.
+All accumulate whole numbers, so that the grid does not depend on the order in which views arrive,
+and all remember the stamps they hold, so that a view counts once however often it is sent.
 """
 
 from __future__ import annotations
@@ -97,8 +98,8 @@ class Carver:
         Parameters
         ----------
         view : View
-            For the soft method l_out (float32, NaN unknown); for the hard one a shadow mask (uint8:
-            255 shadow, 0 outside, 128 unknown).
+            For the soft method l_out (float32, NaN unknown); for the others a shadow mask (uint8: 255
+            shadow, 0 outside, 128 unknown).
 
         Returns
         -------
@@ -135,7 +136,8 @@ class Carver:
 
     def _image(self, view: View) -> NDArray[np.float32]:
         pixels = view.pixels
-        if self.parameters.method == "soft":
+        method = self.parameters.method
+        if not self.parameters.takes_masks:
             if pixels.dtype != np.float32:
                 raise ViewError(f"soft carving got {pixels.dtype} pixels; expected float32 l_out")
             low, high = float(np.nanmin(pixels, initial=1.0)), float(np.nanmax(pixels, initial=0.0))
@@ -143,13 +145,16 @@ class Carver:
                 raise ViewError(f"l_out of the view spans [{low:g}, {high:g}]; expected [0, 1] or NaN")
             return np.ascontiguousarray(pixels)
         if pixels.dtype != np.uint8:
-            raise ViewError(f"hard carving got {pixels.dtype} pixels; expected a uint8 mask")
+            raise ViewError(f"{method} carving got {pixels.dtype} pixels; expected a uint8 mask")
+        odd = ~((pixels == MASK_SHADOW) | (pixels == MASK_OUTSIDE) | (pixels == MASK_UNKNOWN))
+        if odd.any():
+            raise ViewError(f"shadow mask holds the value {pixels[odd][0]}; expected 0, 128 or 255")
         outside = np.where(pixels == MASK_SHADOW, np.float32(0.0), np.float32(1.0))
         outside[pixels == MASK_UNKNOWN] = np.nan
         return outside
 
     def likelihood(self) -> NDArray[np.float32]:
-        """Return the mean of l_out (hard: the fraction of views that removed the voxel); NaN unknown."""
+        """Return the mean of l_out (masks: the fraction of views that contradict the voxel); NaN unknown."""
         least = max(1, math.ceil(self.parameters.min_views_fraction * len(self.stamps)))
         with np.errstate(divide="ignore", invalid="ignore"):
             mean = self._total / (self._count.astype(np.float32) * np.float32(_SCALE))
@@ -168,7 +173,7 @@ class Carver:
         likelihood = self.likelihood()
         p = self.parameters
         threshold = p.threshold or object_threshold(likelihood, p.method)
-        occupied = occupied_voxels(likelihood, threshold)
+        occupied = occupied_voxels(likelihood, threshold, p.method)
         return VoxelGrid(self.volume, likelihood, self._count.copy(), threshold, occupied, p.method)
 
 

@@ -421,6 +421,16 @@ class ViewInfo:
     carrier_rad_m: tuple[float, float] = (0.0, 0.0)
     focus_range_m: float = math.nan
 
+    @property
+    def resolution_m(self) -> tuple[float, float]:
+        """Size of a resolution cell on the ground, (down-range, cross-range).
+
+        2π over the wedge's extent: K(f_c + B/2) - K(f_c - B/2) down-range, 2 K(f_c) sin(w/2) cross-range.
+        """
+        low, mid, high = self.acoustics.ground_band(self.camera.grazing_rad)
+        cross = 2.0 * mid * math.sin(min(self.aperture_rad, math.pi) / 2.0)
+        return TWO_PI / (high - low), TWO_PI / cross if cross > 0 else math.inf
+
     def down_range_of_rows(self) -> FloatArray:
         """Down-range e_r · p (m) of each row's centre, shape (rows,)."""
         e_r = down_range_axis(self.aspect_rad)

@@ -134,6 +134,11 @@ def seabed_level(amplitude: FloatImage, background: str) -> FloatImage:
         raise ViewError(f"view has {known} known pixels; expected at least {_MIN_PIXELS} to estimate its levels")
     block = max(8, min(rows, cols) // 24)
     medians, v, u = _block_medians(amplitude, block)
+    if medians.size == 0:
+        raise ViewError(
+            f"no block of {block} x {block} pixels of the view is wholly known; expected some to estimate its"
+            " levels from"
+        )
     medians_ok = medians > 0
     medians, v, u = medians[medians_ok], v[medians_ok], u[medians_ok]
     if medians.size == 0:

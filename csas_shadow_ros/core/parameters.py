@@ -155,16 +155,30 @@ class LikelihoodParameters(Parameters):
 class CarvingParameters(Parameters):
     """Space carving (section 4)."""
 
-    method: str = bounded("soft", "soft: mean likelihood; hard: segmented silhouettes", choices=("soft", "hard"))
+    method: str = bounded(
+        "consensus",
+        "consensus: silhouettes, few views may contradict; hard: none may; soft: mean likelihood",
+        choices=("consensus", "hard", "soft"),
+    )
     voxel_size_m: float = bounded(0.02, "edge of a voxel", low=1e-4, high=1e3, unit="m")
-    threshold: float = bounded(0.0, "object where the mean l_out is below this; 0: automatic", low=0.0, high=1.0)
+    threshold: float = bounded(
+        0.0,
+        "object where the mean l_out (silhouettes: the contradicting fraction of the views) is below this; 0: automatic",
+        low=0.0,
+        high=1.0,
+    )
     min_views_fraction: float = bounded(
-        0.25, "a voxel seen by a smaller fraction of the views is unknown", low=0.0, high=1.0
+        0.05, "a voxel seen by a smaller fraction of the views is unknown", low=0.0, high=1.0
     )
 
+    @property
+    def takes_masks(self) -> bool:
+        """Whether the method carves with segmented silhouettes rather than likelihoods."""
+        return self.method != "soft"
+
     def other(self) -> CarvingParameters:
-        """Return the same parameters for the other method, with its automatic threshold."""
-        return dataclasses.replace(self, method="hard" if self.method == "soft" else "soft", threshold=0.0)
+        """Return the same parameters for the other kind of method, with its automatic threshold."""
+        return dataclasses.replace(self, method="soft" if self.takes_masks else "hard", threshold=0.0)
 
 
 @dataclass(frozen=True)

@@ -191,7 +191,7 @@ def _integrate(result: Result, carvers: list[Carver], view: ProcessedView) -> No
     used = False
     for carver in carvers:
         try:
-            if carver.parameters.method == "hard":
+            if carver.parameters.takes_masks:
                 integrated = carver.integrate(require_silhouette(view.mask))  # 4.1 space carving
             else:
                 integrated = carver.integrate(view.likelihood)  # 4.2 soft carving

@@ -16,30 +16,38 @@ from numpy.typing import NDArray
 
 from .carving import MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from .errors import ViewError
-from .geometry import View
+from .geometry import View, ViewInfo
 from .likelihood import Levels, box_mean, echo_mask, view_levels
 from .parameters import LikelihoodParameters
 
+#: Shadow where the local mean power is under this fraction of the seabed's. At a straight edge, half of the
+#: box lies on seabed and the mean is 0.5; a little less balances the views that look past the edge.
+_DARK = 0.42
+#: The averaging box reaches no farther than this (pixels).
+_MAX_RADIUS = 8
+#: The flank of a shadow without an echo before it (pixels).
+_FLANK_PX = 2
 #: Smaller dark patches are speckle.
 _MIN_SHADOW_PIXELS = 25
 #: Patches of at least this fraction of the largest are shadows of the target's outline.
 _LARGE_PATCH = 0.3
 
 
-def dark_pixels(levels: Levels, radius_px: tuple[int, int] = (2, 2)) -> NDArray[np.bool_]:
+def dark_pixels(levels: Levels, info: ViewInfo) -> NDArray[np.bool_]:
     """Mark pixels whose local mean power belongs to shadow rather than to seabed.
 
     Parameters
     ----------
     levels : Levels
         The view relative to its seabed level.
-    radius_px : (int, int)
-        Half-size of the averaging box, (rows, cols).
+    info : ViewInfo
+        Its resolution: the mean is taken over about two cells either way, enough looks to tell a
+        shadow from a dark speckle.
     """
-    power = box_mean(levels.power, levels.known, radius_px)
-    # At an edge, a box half on shadow has half the seabed's power: 0.5 is where the edge itself lies.
-    # Speckle asks for less; the geometric mean of both levels is the floor of what makes sense.
-    return (power < max(0.35, 1.0 / levels.contrast)) & levels.known
+    cells = zip(info.resolution_m, info.camera.spacing_m, strict=True)
+    rows, cols = (int(min(max(round(cell / pixel), 1), _MAX_RADIUS)) for cell, pixel in cells)
+    power = box_mean(levels.power, levels.known, (rows, cols))
+    return (power < max(_DARK, 1.0 / levels.contrast)) & levels.known
 
 
 def segment_shadow(
@@ -78,14 +86,11 @@ def segment_shadow(
     """
     p = parameters or LikelihoodParameters()
     levels = levels or view_levels(view, p)
-    dark = dark_pixels(levels).view(np.uint8)
-    cleaned = cv2.morphologyEx(dark, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    cleaned = cv2.morphologyEx(cleaned, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    shadow = _of_target(cleaned, view, target_m, reach_m)
+    shadow = _of_target(dark_pixels(levels, view.info).view(np.uint8), view, target_m, reach_m)
     mask = np.full(levels.known.shape, MASK_OUTSIDE, np.uint8)
-    mask[_before_shadow(shadow)] = MASK_UNKNOWN
     if p.echo_unknown:
-        mask[echo_mask(levels.power, levels.known, p.echo_db)] = MASK_UNKNOWN
+        echo = echo_mask(levels.power, levels.known, p.echo_db)
+        mask[_before_shadow(shadow, echo) | echo] = MASK_UNKNOWN
     mask[shadow] = MASK_SHADOW
     mask[~levels.known] = MASK_UNKNOWN
     return replace(view, pixels=mask)
@@ -113,27 +118,35 @@ def _of_target(
     return keep[labels]
 
 
-def _before_shadow(shadow: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mark the pixels up-range of the target's shadow that the target itself may cover.
+def _before_shadow(shadow: NDArray[np.bool_], echo: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mark the pixels between the target's echo and its shadow: the target covers them.
 
-    The shadow hides the seabed from the target's foot on; between the foot and where the view turns
-    dark lies the target's own echo, bright or faint. How deep it is cannot be seen, so that all of
-    the column within the shadow's own length is left open. Only the large patches count: a small one
-    may be a hole in the target (a tyre's), with more of its echo behind.
+    The shadow hides the seabed from the target's foot on. Between the foot and where the view turns
+    dark lies the target's own echo: a bright edge towards the sonar, then often a top as faint as the seabed.
+    In each column, all from the farthest echo (no farther up-range than the shadow is long) to the
+    shadow is left open. Only the large patches count: a small one may be a hole in the target (a
+    tyre's), with more of its echo behind.
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(shadow.view(np.uint8), connectivity=8)
     unknown = np.zeros(shadow.shape, bool)
     if count < 2:
         return unknown
+    # An edge that glitters has dark columns in it: its neighbours speak for them.
+    edge = cv2.dilate(echo.view(np.uint8), np.ones((1, 5), np.uint8)).view(bool)
     areas = stats[1:, cv2.CC_STAT_AREA]
     for label in np.flatnonzero(areas >= _LARGE_PATCH * areas.max()) + 1:
         left, top, width, height = stats[label, :4]
-        patch = labels[top : top + height, left : left + width] == label
+        window = (slice(0, top + height), slice(left, left + width))
+        patch = labels[top : top + height, window[1]] == label
+        filled = patch.any(axis=0)
         first = patch.argmax(axis=0)
-        depth = np.where(patch.any(axis=0), height - patch[::-1].argmax(axis=0) - first, 0)
-        rows = np.arange(top + height)[:, None]
+        length = height - patch[::-1].argmax(axis=0) - first
         first = first + top
-        unknown[: top + height, left : left + width] |= (rows < first) & (rows >= first - depth)
+        rows = np.arange(top + height)[:, None]
+        zone = filled & (rows < first) & (rows >= first - length)
+        seen = edge[window] & zone
+        begin = np.where(seen.any(axis=0), seen.argmax(axis=0), first - _FLANK_PX)
+        unknown[window] |= zone & (rows >= begin)
     return unknown
 
 

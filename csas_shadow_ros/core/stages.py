@@ -187,9 +187,8 @@ def run_views(
     p = parameters or PipelineParameters()
     if stage not in STAGES:
         raise ParameterError(f"stage is {stage!r}; expected one of: {', '.join(STAGES)}")
-    hard = p.carving.method == "hard"
-    if (stage == "shadow_mask") != hard and stage in ("likelihood", "shadow_mask"):
-        expected = "hard" if stage == "shadow_mask" else "one that takes likelihoods (soft)"
+    if stage in ("likelihood", "shadow_mask") and (stage == "shadow_mask") != p.carving.takes_masks:
+        expected = "consensus or hard" if stage == "shadow_mask" else "soft"
         raise ParameterError(f"method is {p.carving.method!r}; expected {expected} for {stage} views")
     result, start = Result(), time.perf_counter()
 
@@ -252,11 +251,11 @@ def _aspect_deg(view: View) -> float:
 
 def _integrate(result: Result, carvers: list[Carver], staged: StagedView, view: View) -> None:
     for carver in carvers:
-        pixels = staged.mask if carver.parameters.method == "hard" else staged.likelihood
+        pixels = staged.mask if carver.parameters.takes_masks else staged.likelihood
         if pixels is None:
             raise ParameterError(f"method is {carver.parameters.method!r}; its views were not made")
         try:
-            if carver.parameters.method == "hard":
+            if carver.parameters.takes_masks:
                 require_silhouette(pixels)
             integrated = carver.integrate(pixels)
         except ViewError as error:

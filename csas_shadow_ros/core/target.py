@@ -111,14 +111,15 @@ def search_views(views: Sequence[View]) -> Search:
     height = min(0.75 * extent * math.tan(camera.grazing_rad), 0.5 * float(camera.sonar_m[2]))
     volume = Volume.around((float(middle[0]), float(middle[1])), (extent, extent, height), voxel)
     smoothing = LikelihoodParameters(smoothing_m=max(voxel, 3.0 * max(camera.spacing_m)))
-    carver = Carver(volume, CarvingParameters(min_views_fraction=0.3))
+    carver = Carver(volume, CarvingParameters(method="soft", min_views_fraction=0.3))
     for view in views:
         try:
-            carver.integrate(outside_likelihood(view, smoothing))
+            likelihood = outside_likelihood(view, smoothing)
         except ViewError:
             continue  # a view without levels has nothing to say here; it is reported where it counts
-    likelihood = carver.likelihood()
-    return Search(tuple(_bodies(likelihood, volume)), volume, likelihood)
+        carver.integrate(likelihood)
+    mean = carver.likelihood()
+    return Search(tuple(_bodies(mean, volume)), volume, mean)
 
 
 def _known_extent(views: Sequence[View]) -> float:

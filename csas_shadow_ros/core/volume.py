@@ -94,7 +94,8 @@ class VoxelGrid:
     volume : Volume
         The lattice.
     likelihood : ndarray of float32, shape (nz, ny, nx)
-        Mean l_out (soft) or fraction of views that removed the voxel (hard); NaN where unknown.
+        Mean l_out (soft), or the fraction of its views that contradict the voxel (consensus, hard); NaN where
+        unknown.
     views : ndarray of uint16, shape (nz, ny, nx)
         How many views know something of each voxel.
     threshold : float
@@ -110,4 +111,4 @@ class VoxelGrid:
     views: NDArray[np.uint16]
     threshold: float
     occupied: NDArray[np.bool_]
-    method: str = "soft"
+    method: str = "consensus"

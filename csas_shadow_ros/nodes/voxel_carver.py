@@ -35,7 +35,7 @@ class VoxelCarverNode(CsasNode):
         self.grid_info = self.publisher("voxel_grid/camera_info", qos.LATCHED)
         self.voxels = self.publisher("voxels", qos.LATCHED)
         self.mesh = self.publisher("mesh", qos.LATCHED)
-        self.stream = "likelihood" if p.method == "soft" else "shadow_mask"
+        self.stream = "shadow_mask" if p.takes_masks else "likelihood"
         self.target = TargetInlet(self, lambda: self.inlet.release())
         self.inlet = Inlet(self, self.stream, "sink", self.work, hold=self.target.missing)
         self.growing = Growing(self.publish_result, self.wanted, p.publish_hz)
