@@ -82,7 +82,11 @@ class Carver:
     """
 
     def __init__(
-        self, volume: Volume, parameters: CarvingParameters | None = None, *, pool: ThreadPoolExecutor | None = None
+        self,
+        volume: Volume,
+        parameters: CarvingParameters | None = None,
+        *,
+        pool: ThreadPoolExecutor | None = None,
     ) -> None:
         self.volume = volume
         self.parameters = parameters or CarvingParameters()

@@ -39,7 +39,9 @@ class Composites:
         """Make the accumulator whose grid covers what views like this one cover."""
         camera = view.info.camera
         spacing = float(np.mean(camera.spacing_m))
-        middle = camera.pixel_to_ground[:2] @ np.array([(camera.cols - 1) / 2.0, (camera.rows - 1) / 2.0, 1.0])
+        middle = camera.pixel_to_ground[:2] @ np.array(
+            [(camera.cols - 1) / 2.0, (camera.rows - 1) / 2.0, 1.0]
+        )
         side = max(camera.shape)
         return cls(GroundGrid.centred(side, side, spacing, (float(middle[0]), float(middle[1]))))
 

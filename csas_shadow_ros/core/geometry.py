@@ -277,7 +277,9 @@ class ShadowCamera:
         det = float(np.linalg.det(ground[:2, :2]))
         if det >= 0.0 or abs(det) < 1e-9 * row_scale**2:
             fault = "mirrors" if det > 0 else "flattens"
-            raise GeometryError(f"P {fault} the ground (det A = {det:g}); expected a rotated map, rows down-range")
+            raise GeometryError(
+                f"P {fault} the ground (det A = {det:g}); expected a rotated map, rows down-range"
+            )
         self.projection.flags.writeable = False
 
     @classmethod
@@ -716,7 +718,9 @@ def fit_target_to_focus(infos: Sequence[ViewInfo]) -> tuple[float, float]:
     """
     focused = [i for i in infos if math.isfinite(i.focus_range_m)]
     if len(focused) < 2:
-        raise GeometryError(f"{len(focused)} views have a focus range; expected at least 2 to locate the target")
+        raise GeometryError(
+            f"{len(focused)} views have a focus range; expected at least 2 to locate the target"
+        )
     axes = np.array([down_range_axis(i.aspect_rad) for i in focused])
     ranges = np.array([i.focus_range_m for i in focused])
     if np.linalg.svd(axes, compute_uv=False)[-1] < 1e-3 * math.sqrt(len(focused)):

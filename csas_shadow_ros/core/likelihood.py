@@ -131,7 +131,9 @@ def seabed_level(amplitude: FloatImage, background: str) -> FloatImage:
     rows, cols = amplitude.shape
     known = int(np.isfinite(amplitude).sum())
     if known < _MIN_PIXELS:
-        raise ViewError(f"view has {known} known pixels; expected at least {_MIN_PIXELS} to estimate its levels")
+        raise ViewError(
+            f"view has {known} known pixels; expected at least {_MIN_PIXELS} to estimate its levels"
+        )
     block = max(8, min(rows, cols) // 24)
     medians, v, u = _block_medians(amplitude, block)
     if medians.size == 0:

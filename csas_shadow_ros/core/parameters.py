@@ -112,7 +112,9 @@ class SubApertureParameters(Parameters):
     oversampling: float = bounded(
         1.5, "view pixels per resolution cell of the wedge's bandwidth", low=1.0, high=8.0
     )
-    spacing_m: float = bounded(0.0, "pixel of the views; 0: from the wedge's bandwidth", low=0.0, high=100.0, unit="m")
+    spacing_m: float = bounded(
+        0.0, "pixel of the views; 0: from the wedge's bandwidth", low=0.0, high=100.0, unit="m"
+    )
     extent_m: float = bounded(
         0.0, "side of the square views; 0: whole image at every aspect", low=0.0, high=1e5, unit="m"
     )
@@ -127,7 +129,9 @@ class ShadowParameters(Parameters):
     """Shadow enhancement, FFSE (section 3.2)."""
 
     enhancement: str = bounded(
-        "exact", "filter: exact, the paper's simplified one, or none", choices=("exact", "small_angle", "none")
+        "exact",
+        "filter: exact, the paper's simplified one, or none",
+        choices=("exact", "small_angle", "none"),
     )
 
 
@@ -145,10 +149,16 @@ class LikelihoodParameters(Parameters):
         12.0, "seabed over shadow level; start of the estimate", low=1.0, high=60.0, unit="dB"
     )
     smoothing_m: float = bounded(
-        0.0, "multi-look smoothing before the likelihood; 0: none, as in the paper", low=0.0, high=10.0, unit="m"
+        0.0,
+        "multi-look smoothing before the likelihood; 0: none, as in the paper",
+        low=0.0,
+        high=10.0,
+        unit="m",
     )
     echo_unknown: bool = bounded(True, "target echo knows nothing (NaN) instead of outside")
-    echo_db: float = bounded(8.0, "echo: smoothed intensity above the seabed by", low=1.0, high=60.0, unit="dB")
+    echo_db: float = bounded(
+        8.0, "echo: smoothed intensity above the seabed by", low=1.0, high=60.0, unit="dB"
+    )
 
 
 @dataclass(frozen=True)
@@ -190,7 +200,12 @@ class TargetParameters(Parameters):
         (0.0, 0.0), "x, y of the target when given", low=-1e6, high=1e6, unit="m", length=2
     )
     size_m: tuple[float, ...] = bounded(
-        (0.0, 0.0, 0.0), "x, y, z size of the carved volume; 0: automatic", low=0.0, high=1e5, unit="m", length=3
+        (0.0, 0.0, 0.0),
+        "x, y, z size of the carved volume; 0: automatic",
+        low=0.0,
+        high=1e5,
+        unit="m",
+        length=3,
     )
 
 

@@ -79,13 +79,17 @@ class Result:
     timings_s: dict[str, float] = field(default_factory=dict)
 
 
-def process_view(sub_apertures: SubApertures, aspect_rad: float, target: Target, p: PipelineParameters) -> ProcessedView:
+def process_view(
+    sub_apertures: SubApertures, aspect_rad: float, target: Target, p: PipelineParameters
+) -> ProcessedView:
     """Take one aspect through every stage of the paper."""
     sub_aperture = sub_apertures.view_of_aspect(aspect_rad)  # 3.1 spectral masking
     shadow = enhance(sub_aperture, target.position_m, p.shadow)  # 3.2 fixed focus shadow enhancement
     levels = view_levels(shadow, p.likelihood)  # 4.2 σ_r and σ_s
     likelihood = outside_likelihood(shadow, p.likelihood, levels)  # 4.2 l_out
-    mask = segment_shadow(shadow, target.position_m, p.likelihood, levels, reach_m=target.reach_m)  # 4.1 silhouette
+    mask = segment_shadow(
+        shadow, target.position_m, p.likelihood, levels, reach_m=target.reach_m
+    )  # 4.1 silhouette
     return ProcessedView(sub_aperture, shadow, levels, likelihood, mask)
 
 
@@ -148,7 +152,11 @@ def run(
 
     def make(aspect: float) -> ProcessedView | View | ViewError:
         try:
-            return process_view(sub_apertures, aspect, target, p) if target else sub_apertures.view_of_aspect(aspect)
+            return (
+                process_view(sub_apertures, aspect, target, p)
+                if target
+                else sub_apertures.view_of_aspect(aspect)
+            )
         except ViewError as error:
             return error
 

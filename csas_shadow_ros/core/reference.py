@@ -111,4 +111,3 @@ def enhance(
 def focus_range(aspect_rad: float, target_m: tuple[float, float]) -> float:
     """Return r₀ = e_r · target."""
     return float(down_range_axis(aspect_rad) @ np.asarray(target_m))
-

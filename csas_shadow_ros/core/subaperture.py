@@ -158,7 +158,12 @@ def _cut_wedge(
     rows, cols = spectrum.shape
     out_rows, out_cols = out.shape
     # The wedge is half-open, [θ - w/2, θ + w/2), so that neighbours share no bin and leave none out.
-    cos_l, sin_l, cos_h, sin_h = math.cos(edge_low), math.sin(edge_low), math.cos(edge_high), math.sin(edge_high)
+    cos_l, sin_l, cos_h, sin_h = (
+        math.cos(edge_low),
+        math.sin(edge_low),
+        math.cos(edge_high),
+        math.sin(edge_high),
+    )
     low2, high2 = band[0] * band[0], band[1] * band[1]
     tapered = taper.shape[0] > 1
     for dv in range(-half[0], half[0] + 1):
@@ -215,8 +220,12 @@ def _resample(box, table, affine, limits, out):  # pragma: no cover
             im = np.float32(0.0)
             for j in range(np.uintp(4)):
                 w = weights[wy + j]
-                re += w * (w0 * flat[first] + w1 * flat[first + 2] + w2 * flat[first + 4] + w3 * flat[first + 6])
-                im += w * (w0 * flat[first + 1] + w1 * flat[first + 3] + w2 * flat[first + 5] + w3 * flat[first + 7])
+                re += w * (
+                    w0 * flat[first] + w1 * flat[first + 2] + w2 * flat[first + 4] + w3 * flat[first + 6]
+                )
+                im += w * (
+                    w0 * flat[first + 1] + w1 * flat[first + 3] + w2 * flat[first + 5] + w3 * flat[first + 7]
+                )
                 first += stride
             out[v, u, 0] = re
             out[v, u, 1] = im
@@ -393,9 +402,15 @@ class SubApertures:
         # The image reaches half a pixel beyond the centres of its outer pixels.
         last = np.array([self.grid.cols, self.grid.rows]) - 0.5
         limits = np.column_stack([-0.5 * scale, last * scale]).ravel() + _BORDER
-        extended = np.pad(box, _BORDER, mode="wrap").view(np.float32).reshape(*(n + 2 * _BORDER for n in box.shape), 2)
+        extended = (
+            np.pad(box, _BORDER, mode="wrap")
+            .view(np.float32)
+            .reshape(*(n + 2 * _BORDER for n in box.shape), 2)
+        )
         pixels = np.empty(info.camera.shape, np.complex64)
-        _resample(extended, _kernel_table(), affine, limits, pixels.view(np.float32).reshape(*pixels.shape, 2))
+        _resample(
+            extended, _kernel_table(), affine, limits, pixels.view(np.float32).reshape(*pixels.shape, 2)
+        )
         return View(info, pixels)
 
     def view(self, index: int) -> View:

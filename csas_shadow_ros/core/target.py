@@ -232,7 +232,9 @@ def choose_target(search: Search | None, parameters: TargetParameters) -> Target
 
 
 def _covers(target: Target, position_m: tuple[float, ...]) -> bool:
-    return all(abs(p - t) <= s / 2 for p, t, s in zip(position_m, target.position_m, target.size_m, strict=False))
+    return all(
+        abs(p - t) <= s / 2 for p, t, s in zip(position_m, target.position_m, target.size_m, strict=False)
+    )
 
 
 @dataclass(frozen=True)
@@ -301,4 +303,3 @@ def spectrum_sign_evidence(
     other = _search_image(replace(image, acoustics=acoustics), track, spectrum)
     scores = [s.best.evidence if s is not None and s.best is not None else 0.0 for s in (stated, other)]
     return SignEvidence(image.acoustics.spectrum_sign, scores[0], scores[1]), stated
-

@@ -77,9 +77,7 @@ def supported(dark: NDArray[np.bool_], likelihood: NDArray[np.float32], limit: f
     return out
 
 
-def occupied_voxels(
-    likelihood: NDArray[np.float32], threshold: float, method: str
-) -> NDArray[np.bool_]:
+def occupied_voxels(likelihood: NDArray[np.float32], threshold: float, method: str) -> NDArray[np.bool_]:
     """Return the object's voxels: under the threshold, supported, without stray pieces.
 
     Parameters
