@@ -19,7 +19,6 @@ from functools import lru_cache
 import numba
 import numpy as np
 import scipy.fft
-import scipy.signal.windows
 from numpy.typing import NDArray
 
 from .errors import ParameterError, TrackError, ViewError
@@ -119,10 +118,13 @@ def taper_table(name: str, entries: int = 1025) -> NDArray[np.float32]:
     """
     if name == "none":
         return np.ones(entries, np.float32)
+    # Late: it takes a second and a half to import, which every process of the node graph would pay.
+    from scipy.signal import windows
+
     if name == "tukey":
-        return scipy.signal.windows.tukey(entries, 0.5).astype(np.float32)
+        return np.asarray(windows.tukey(entries, 0.5), np.float32)
     if name == "taylor":
-        return scipy.signal.windows.taylor(entries, nbar=4, sll=30).astype(np.float32)
+        return np.asarray(windows.taylor(entries, nbar=4, sll=30), np.float32)
     raise ParameterError(f"taper is {name!r}; expected one of: none, tukey, taylor")
 
 
