@@ -15,8 +15,8 @@ from msg_adapters import STREAMS, TOPICS, VIEW_STREAMS, Heartbeat
 from msg_adapters.topics import absolute_name
 
 from . import qos
-from .bag_player import header_stamp
 from .base import INTEGRATED, CsasNode, Inlet, run_node
+from .playing import header_stamp
 
 #: Streams whose pairs take part in flow control.
 _FLOWING = (*VIEW_STREAMS, "sector")

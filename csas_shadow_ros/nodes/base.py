@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import signal
@@ -13,7 +14,7 @@ import traceback
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import rclpy
 from rclpy.context import Context
@@ -27,7 +28,6 @@ from rclpy.signals import SignalHandlerOptions
 
 from csas_shadow_ros.core.errors import CsasError, ParameterError
 from csas_shadow_ros.core.geometry import View
-from csas_shadow_ros.core.target import Target
 from msg_adapters import (
     TOPICS,
     Heartbeat,
@@ -41,6 +41,7 @@ from msg_adapters import (
     progress_to_msg,
     stamp_to_ns,
     target_from_msg,
+    view_info_from_msg,
     view_to_msgs,
 )
 from msg_adapters.progress import INTEGRATED, PUBLISHED, REJECTED
@@ -49,6 +50,9 @@ from msg_adapters.topics import stream as stream_of
 from . import qos
 from .flow import Flow
 from .params import NODES, declare, from_overrides
+
+if TYPE_CHECKING:
+    from csas_shadow_ros.core.target import Target
 
 NAMESPACE = "csas"
 BEAT_S = 0.5
@@ -252,7 +256,8 @@ class CsasNode(LifecycleNode):
         self._reports.publish(progress_to_msg(self.messages, item))
 
     def _send_beats(self, *, leaving: bool = False) -> None:
-        for voice in (*self.inlets, *self.sources):
+        voices: list[Inlet | Source] = [*self.inlets, *self.sources]
+        for voice in voices:
             beat = voice.beat(leaving=leaving)
             self._heartbeats.publish(progress_to_msg(self.messages, beat))
 
@@ -466,7 +471,7 @@ class Inlet:
             outcome = self._work(image, info)
         except CsasError as error:
             self.node.reject(str(error))
-            self.report(stamp, REJECTED, str(error))
+            self.report(stamp, REJECTED, str(error), **self._aspect_of(info))
             return
         self._seen[stamp] = None
         if len(self._seen) > 1 << 16:
@@ -474,16 +479,24 @@ class Inlet:
         if outcome is not None:
             self.report(stamp, outcome)
 
+    def _aspect_of(self, info: Any) -> dict[str, str]:
+        """Say which aspect a refused view is of, as far as that is legible."""
+        try:
+            aspect = view_info_from_msg(info, self.stream).aspect_rad
+        except CsasError:
+            return {}
+        return {"aspect_deg": f"{math.degrees(aspect):.6f}"}
+
     def release(self) -> None:
         """Work on the views that were held."""
         while self.held and not self._hold():
             self._work_on(*self.held.popleft())
 
-    def report(self, stamp_ns: int, outcome: str, reason: str = "") -> None:
+    def report(self, stamp_ns: int, outcome: str, reason: str = "", **more: str) -> None:
         """Tell the sources what became of a view."""
         self.node.counts["out" if outcome == PUBLISHED else outcome] += outcome != REJECTED
         level = Level.WARN if outcome == REJECTED else Level.OK
-        values = {"role": self.role, "input": self.stream}
+        values = {"role": self.role, "input": self.stream, **more}
         self.node.send_report(
             ViewProgress(stamp_ns, self.node.name, self.instance, outcome, reason, level, values)
         )
@@ -681,6 +694,9 @@ class TargetInlet:
         self.known = p.target == "given"
         self.target: Target | None = None
         if self.known:
+            # Late: the search behind it takes seconds to import, and most nodes need none of it.
+            from csas_shadow_ros.core.target import Target
+
             size = getattr(p, "size_m", (0.0, 0.0, 0.0))
             self.target = Target((p.position_m[0], p.position_m[1]), (size[0], size[1], size[2]))
         else:
@@ -700,6 +716,8 @@ class TargetInlet:
 
     @staticmethod
     def _target_of(box: TargetBox | None) -> Target | None:
+        from csas_shadow_ros.core.target import Target
+
         return None if box is None else Target((box.centre_m[0], box.centre_m[1]), box.size_m)
 
     @staticmethod

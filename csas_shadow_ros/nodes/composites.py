@@ -6,6 +6,8 @@ import sys
 import time
 from typing import Any
 
+from numpy.typing import NDArray
+
 from csas_shadow_ros.core.composites import Composites
 from csas_shadow_ros.core.geometry import Acoustics
 from msg_adapters import GroundInfo, Heartbeat, ground_picture_to_msgs, view_from_msgs
@@ -76,7 +78,7 @@ class CompositesNode(CsasNode):
         if self.composites is None or self.acoustics is None:
             return
         ground = GroundInfo(max(self.composites.stamps), self.composites.grid, self.acoustics)
-        pixels = {
+        pixels: dict[str, NDArray[Any]] = {
             "multilook": self.composites.multilook(),
             "color_by_aspect": self.composites.color_by_aspect(self.parameters.dynamic_range_db),
         }

@@ -1,0 +1,733 @@
+"""Replay a bag through the node graph: every node a process of its own, as `ros2 launch` does it.
+
+`replay` starts the processes, watches them, restarts one that dies, collects the result from the
+latched topics, and ends its own processes by their ids, whatever happens.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from .bags import read_run
+from .core import errors
+from .core.errors import CsasError, NoTargetError
+from .core.geometry import GroundGrid
+from .core.mesh import Dimensions, measure
+from .core.parameters import PipelineParameters
+from .core.stages import target_of_views
+from .core.target import Target
+from .core.threshold import object_threshold, occupied_voxels
+from .core.volume import VoxelGrid
+from .nodes.params import NODES, check, yaml_text
+
+PACKAGE = "csas_shadow_ros"
+#: Stages of a bag, and the nodes that turn each into the next.
+_CHAIN = {
+    "image": ("sub_aperture", "shadow_enhancement", "shadow_likelihood", "voxel_carver"),
+    "sector": ("sub_aperture", "shadow_enhancement", "shadow_likelihood", "voxel_carver"),
+    "sub_aperture": ("shadow_enhancement", "shadow_likelihood", "voxel_carver"),
+    "shadow": ("shadow_likelihood", "voxel_carver"),
+    "likelihood": ("voxel_carver",),
+    "shadow_mask": ("voxel_carver",),
+}
+_WITH_COMPOSITES = ("image", "sector", "sub_aperture")
+#: Each process has its own numerical libraries: as many threads in each as there are cores would only wait.
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class ReplayError(CsasError):
+    """The graph could not bring a replay to its end."""
+
+
+@dataclass(frozen=True)
+class NodeReport:
+    """What one node says of its part.
+
+    Parameters
+    ----------
+    busy_s : float
+        Seconds that it computed, converted and published.
+    restarts : int
+        How often its process was started again.
+    counts : dict
+        Its counts: views in, out, rejected, ...
+    """
+
+    busy_s: float
+    restarts: int
+    counts: dict[str, int]
+
+
+@dataclass(frozen=True)
+class RejectedView:
+    """A view that was not used.
+
+    Parameters
+    ----------
+    node : str
+        Who refused it.
+    stamp_ns : int
+        Its stamp.
+    aspect_deg : float
+        Its aspect; NaN if it was not legible.
+    reason : str
+        Why.
+    """
+
+    node: str
+    stamp_ns: int
+    aspect_deg: float
+    reason: str
+
+
+@dataclass(eq=False)
+class ReplayResult:
+    """What a replay leaves.
+
+    Attributes
+    ----------
+    stage : str
+        What the bag was played from.
+    target : Target or None
+        The volume that was carved; None: there is no object.
+    grid : VoxelGrid or None
+        The carved grid. `views` holds numbers for the occupied voxels alone: the others' do not travel.
+    mesh, dimensions : trimesh.Trimesh, Dimensions or None
+        Surface and measures of the object.
+    composites : dict
+        ``multilook`` (float32) and ``color_by_aspect`` (uint8, RGB), where they were made.
+    composites_grid : GroundGrid or None
+        Their lattice.
+    views_total, views_used : int
+        Views that the source had, and views in the grid.
+    rejected : list of RejectedView
+        Views that were not used.
+    lost : int
+        Views that vanished on their way; expected 0.
+    nodes : dict of NodeReport
+        Each node's part, by name.
+    recording : Path or None
+        The bag that was recorded.
+    seconds : float
+        Wall time, from the first process to the result.
+    """
+
+    stage: str
+    target: Target | None = None
+    grid: VoxelGrid | None = None
+    mesh: trimesh.Trimesh | None = None
+    dimensions: Dimensions | None = None
+    composites: dict[str, NDArray[Any]] = field(default_factory=dict)
+    composites_grid: GroundGrid | None = None
+    views_total: int = 0
+    views_used: int = 0
+    rejected: list[RejectedView] = field(default_factory=list)
+    lost: int = 0
+    nodes: dict[str, NodeReport] = field(default_factory=dict)
+    recording: Path | None = None
+    seconds: float = 0.0
+
+
+def config_file(name: str) -> Path:
+    """Find a file of ``config/``: in the source tree, or where the package was installed.
+
+    Raises
+    ------
+    ReplayError
+        If it is nowhere.
+    """
+    here = Path(__file__).resolve()
+    prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
+    places = [here.parents[1] / "config" / name]
+    places += [Path(prefix) / "share" / PACKAGE / "config" / name for prefix in prefixes if prefix]
+    for place in places:
+        if place.is_file():
+            return place
+    raise ReplayError(f"{name} is nowhere; expected it at one of: {', '.join(map(str, places))}")
+
+
+def free_domain_id() -> int:
+    """Return a ROS domain whose discovery port nobody on this machine uses.
+
+    Raises
+    ------
+    ReplayError
+        If all are in use.
+    """
+    # Linux hands out ports from 32768 on to whoever asks: domains up to 101 lie below them.
+    for domain in random.sample(range(1, 102), 101):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("", 7400 + 250 * domain))
+            except OSError:
+                continue
+            return domain
+    raise ReplayError("every ROS domain from 1 to 101 is in use on this machine")
+
+
+def graph_environment(domain_id: int, log_dir: Path) -> dict[str, str]:
+    """Return the environment of the graph's processes: this machine alone, shared memory, few threads."""
+    profile = str(config_file("fastdds_shm.xml"))
+    own = {
+        "ROS_DOMAIN_ID": str(domain_id),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "FASTRTPS_DEFAULT_PROFILES_FILE": profile,
+        "FASTDDS_DEFAULT_PROFILES_FILE": profile,
+        "ROS_LOG_DIR": str(log_dir),
+        "CSAS_PARENT_PID": str(os.getpid()),
+    }
+    own.setdefault("AMENT_PREFIX_PATH", os.environ.get("AMENT_PREFIX_PATH", sys.prefix))
+    root = str(Path(__file__).resolve().parents[1])
+    path = os.environ.get("PYTHONPATH", "")
+    own["PYTHONPATH"] = f"{root}{os.pathsep}{path}" if path else root
+    return {**os.environ, **own, **{name: os.environ.get(name, "1") for name in _THREADS}}
+
+
+@contextlib.contextmanager
+def _environment(values: Mapping[str, str]) -> Iterator[None]:
+    before = dict(os.environ)
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+
+
+class GraphProcess:
+    """One node's process: started, watched, started again, ended by its id.
+
+    Parameters
+    ----------
+    node : str
+        Name of the node.
+    environment : mapping
+        Its environment.
+    log_dir : Path
+        Where its output goes.
+    parameter_file : Path, optional
+        ROS parameter file.
+    """
+
+    def __init__(
+        self, node: str, environment: Mapping[str, str], log_dir: Path, parameter_file: Path | None = None
+    ) -> None:
+        self.node = node
+        self.log = log_dir / f"{node}.log"
+        self.restarts = -1
+        self._environment = dict(environment)
+        self._arguments = ["--ros-args", "--params-file", str(parameter_file)] if parameter_file else []
+        self._process: subprocess.Popen[bytes] | None = None
+        self._log_file: IO[bytes] | None = None
+
+    @property
+    def pid(self) -> int:
+        """Id of the running process.
+
+        Raises
+        ------
+        ReplayError
+            If it was not started.
+        """
+        if self._process is None:
+            raise ReplayError(f"{self.node} was not started")
+        return self._process.pid
+
+    def start(self) -> None:
+        """Start the process, or start it again."""
+        self.close_log()
+        self._log_file = self.log.open("ab")
+        self.restarts += 1
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", f"{PACKAGE}.nodes.{self.node}", *self._arguments],
+            env=self._environment,
+            stdin=subprocess.DEVNULL,
+            stdout=self._log_file,
+            stderr=subprocess.STDOUT,
+            # Not in the terminal's group: on Ctrl-C we end the processes ourselves, in order.
+            start_new_session=True,
+        )
+
+    def poll(self) -> int | None:
+        """Return the exit status, None while the process runs."""
+        return None if self._process is None else self._process.poll()
+
+    def signal(self, number: int) -> None:
+        """Send a signal if the process runs."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.send_signal(number)
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait for the process to end; kill it after the timeout."""
+        if self._process is None:
+            return
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def close_log(self) -> None:
+        """Close the log file."""
+        if self._log_file is not None:
+            self._log_file.close()
+            self._log_file = None
+
+    def last_line(self) -> str:
+        """Return the last line of the process' output."""
+        lines = self.log.read_text(errors="replace").strip().splitlines() if self.log.exists() else []
+        return lines[-1] if lines else "no output"
+
+
+class Graph:
+    """The processes of a graph; ends them all when left.
+
+    Parameters
+    ----------
+    parameters : mapping of node name to mapping of parameter name to value
+        One process is started for each node named.
+    domain_id : int
+        ROS domain.
+    log_dir : Path
+        Where logs and the parameter file go.
+    max_restarts : int
+        How often each node may die and be started again.
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Mapping[str, Any]],
+        domain_id: int,
+        log_dir: Path,
+        max_restarts: int = 3,
+    ) -> None:
+        check(parameters)
+        log_dir.mkdir(parents=True, exist_ok=True)
+        self.environment = graph_environment(domain_id, log_dir)
+        file = log_dir / "parameters.yaml"
+        file.write_text(yaml_text(parameters, only_given=True), encoding="utf-8")
+        has_own = {name for name, own in parameters.items() if own}
+        self.processes = {
+            name: GraphProcess(name, self.environment, log_dir, file if name in has_own else None)
+            for name in parameters
+        }
+        self.max_restarts = max_restarts
+        #: One line for each process that died.
+        self.deaths: list[str] = []
+
+    def __enter__(self) -> Graph:
+        try:
+            for process in self.processes.values():
+                process.start()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def watch(self) -> None:
+        """Start again what has died.
+
+        Raises
+        ------
+        ReplayError
+            If a node refuses its parameters or its bag, or died too often; the message has its last line.
+        """
+        for name, process in self.processes.items():
+            code = process.poll()
+            if code is None:
+                continue
+            if code == 2:
+                raise ReplayError(f"{name} refused to start: {process.last_line()}")
+            how = f"was killed by signal {-code}" if code < 0 else f"ended with status {code}"
+            self.deaths.append(f"{name} {how}: {process.last_line()}")
+            if process.restarts >= self.max_restarts:
+                raise ReplayError(f"{name} died {process.restarts + 1} times; {self.deaths[-1]}")
+            process.start()
+
+    def stop(self) -> None:
+        """End all processes: asked first, so that a recorder finishes its bag, then killed."""
+        for process in self.processes.values():
+            process.signal(signal.SIGINT)
+        for name, process in self.processes.items():
+            process.wait(30.0 if name == "bag_recorder" else 5.0)
+            process.close_log()
+
+
+class _Watcher:
+    """Listens to a graph: progress first, and results once they are complete."""
+
+    def __init__(self, graph: Graph, domain_id: int) -> None:
+        # Late, so that reading this module needs no ROS.
+        import rclpy
+        from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
+
+        from msg_adapters import RclpyMessages
+
+        from .nodes import qos
+
+        self._qos = qos
+        self._rclpy = rclpy
+        self._messages = RclpyMessages()
+        self._context = Context()
+        own = {k: v for k, v in graph.environment.items() if k.startswith(("ROS_", "FAST"))}
+        with _environment(own):
+            rclpy.init(context=self._context, domain_id=domain_id)
+            self._node = rclpy.create_node("replay", context=self._context, namespace="csas")
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self.beats: dict[tuple[str, str], Any] = {}
+        self.rejected: dict[tuple[int, str], RejectedView] = {}
+        self.errors: dict[str, str] = {}
+        self.latest: dict[str, Any] = {}
+        self._subscribe("progress", qos.REPORTS, self._on_progress)
+
+    def _subscribe(self, topic: str, profile: Any, callback: Callable[[Any], None]) -> None:
+        from msg_adapters import TOPICS
+
+        kind = self._messages.cls(TOPICS[topic].type_name)
+        self._node.create_subscription(kind, topic, callback, profile)
+
+    def _on_progress(self, msg: Any) -> None:
+        from msg_adapters import Heartbeat, progress_from_msg
+
+        try:
+            item = progress_from_msg(msg)
+        except CsasError:
+            return  # an outside node's; the graph's own are well-formed
+        if isinstance(item, Heartbeat):
+            if item.values.get("leaving") != "true":
+                stream = item.values.get("stream", item.values.get("input", ""))
+                self.beats[item.node, stream] = item
+            if text := item.values.get("error"):
+                self.errors[item.node] = text
+        elif item.outcome == "rejected":
+            aspect = float(item.values.get("aspect_deg", "nan"))
+            view = RejectedView(item.node, item.stamp_ns, aspect, item.reason)
+            self.rejected.setdefault((item.stamp_ns, item.values.get("aspect_deg", "")), view)
+
+    def spin(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def collect(self, topics: tuple[str, ...], timeout_s: float) -> dict[str, Any]:
+        """Return the last message of latched topics: whoever subscribes now gets the final ones."""
+        for topic in topics:
+            self._subscribe(topic, self._qos.LATCHED, partial(self.latest.__setitem__, topic))
+        end = time.monotonic() + timeout_s
+        while not set(topics) <= set(self.latest) and time.monotonic() < end:
+            self._executor.spin_once(timeout_sec=0.1)
+        return self.latest
+
+    def close(self) -> None:
+        self._executor.shutdown(timeout_sec=1.0)
+        self._node.destroy_node()
+        self._rclpy.shutdown(context=self._context)
+
+
+def node_parameters(
+    parameters: PipelineParameters, target: Target | None = None
+) -> dict[str, dict[str, Any]]:
+    """Spread the pipeline's parameters over the nodes.
+
+    Parameters
+    ----------
+    parameters : PipelineParameters
+        Parameters of all stages.
+    target : Target, optional
+        Given to every node behind `sub_aperture`, for bags that hold no image to find it in.
+    """
+
+    def of(*sets: Any) -> dict[str, Any]:
+        return {f.name: getattr(s, f.name) for s in sets for f in fields(s)}
+
+    p = parameters
+    place: dict[str, Any] = {}
+    if target is not None:
+        place = {"target": "given", "position_m": tuple(target.position_m)}
+    box = {**place, "size_m": tuple(target.size_m)} if target is not None else {}
+    return {
+        "sub_aperture": of(p.sub_aperture, p.target),
+        "shadow_enhancement": of(p.shadow) | place,
+        "shadow_likelihood": of(p.likelihood) | box,
+        "voxel_carver": of(p.carving) | box,
+    }
+
+
+def replay(
+    bag: str | Path,
+    out_dir: str | Path | None = None,
+    parameters: PipelineParameters | None = None,
+    *,
+    stage: str = "auto",
+    rate: float = 0.0,
+    record: str | Path | bool = False,
+    composites: bool = True,
+    window: int = 4,
+    domain_id: int | None = None,
+    overrides: Mapping[str, Mapping[str, Any]] | None = None,
+    progress: Callable[[int, int], None] | bool = True,
+    notice: Callable[[str], None] | None = None,
+    max_restarts: int = 3,
+    stall_timeout_s: float = 180.0,
+) -> ReplayResult:
+    """Replay a bag through the node graph and return what it leaves.
+
+    Parameters
+    ----------
+    bag : path-like
+        A rosbag2 directory or a lone storage file.
+    out_dir : path-like, optional
+        Where the nodes' logs go (``log/``), and the recording if `record` is True. A temporary folder
+        otherwise.
+    parameters : PipelineParameters
+        Parameters of all stages, as of the in-process pipeline.
+    stage : str
+        What to play: see the parameter of `bag_player`.
+    rate : float
+        Views: times the recorded speed; 0: as fast as the graph takes them.
+    record : path-like or bool
+        Record all topics into this bag; True: ``out_dir/recording``.
+    composites : bool
+        Make the composites too, where there are sub-aperture views.
+    window : int
+        Views that may be on their way at once.
+    domain_id : int, optional
+        ROS domain, to look on with other tools; a free one otherwise.
+    overrides : mapping of node name to mapping, optional
+        Further node parameters.
+    progress : callable or bool
+        Called with (views done, views in all); True: a bar on the terminal.
+    notice : callable, optional
+        Called with each line that a user should see, such as that a node died.
+    max_restarts : int
+        How often each node may die.
+    stall_timeout_s : float
+        Give up when nothing at all has changed for so long.
+
+    Raises
+    ------
+    CsasError
+        If the bag, a parameter or the image is not usable (as `pipeline.run` raises it), or the graph
+        does not get to its end (`ReplayError`).
+    """
+    p = parameters or PipelineParameters()
+    tell = notice or (lambda _: None)
+    began = time.monotonic()
+    with contextlib.ExitStack() as stack:
+        if out_dir is None:
+            out = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="csas_replay_")))
+        else:
+            out = Path(out_dir)
+        recording = None if record is False else out / "recording" if record is True else Path(record)
+        chosen, target = _plan(bag, stage, p)
+        plan = _node_plan(bag, chosen, p, target, rate, recording, composites, window, overrides or {})
+        domain = free_domain_id() if domain_id is None else domain_id
+        graph = stack.enter_context(Graph(plan, domain, out / "log", max_restarts))
+        watcher = _Watcher(graph, domain)
+        stack.callback(watcher.close)
+        done = stack.enter_context(_shown(progress))
+        _until_complete(graph, watcher, chosen, done, tell, stall_timeout_s)
+        result = _collect(watcher, graph, chosen, p, target)
+        result.recording = recording
+        result.seconds = time.monotonic() - began
+    return result
+
+
+def _plan(bag: str | Path, stage: str, p: PipelineParameters) -> tuple[str, Target | None]:
+    """Say what is played, and where the target is if no node can find it."""
+    from .bags import BagReader
+    from .nodes.playing import stage_of_bag
+
+    reader = BagReader(bag)
+    chosen = stage_of_bag(reader, stage)
+    if chosen in ("image", "sector"):
+        return chosen, None
+    hard = p.carving.takes_masks
+    if chosen in ("likelihood", "shadow_mask") and (chosen == "shadow_mask") != hard:
+        expected = "hard" if chosen == "shadow_mask" else "one that takes likelihoods (soft)"
+        raise errors.ParameterError(
+            f"method is {p.carving.method!r}; expected {expected} for {chosen} views"
+        )
+    run = read_run(bag)
+    target = target_of_views(lambda: run.views(chosen), chosen, p.target)
+    if target is None:
+        raise NoTargetError(f"there is no object in the {chosen} views of {bag}")
+    return chosen, target
+
+
+def _node_plan(
+    bag: str | Path,
+    stage: str,
+    p: PipelineParameters,
+    target: Target | None,
+    rate: float,
+    recording: Path | None,
+    composites: bool,
+    window: int,
+    overrides: Mapping[str, Mapping[str, Any]],
+) -> dict[str, dict[str, Any]]:
+    of_stage = node_parameters(p, target)
+    plan: dict[str, dict[str, Any]] = {name: of_stage[name] for name in _CHAIN[stage]}
+    if composites and stage in _WITH_COMPOSITES:
+        plan["composites"] = {}
+    if recording is not None:
+        plan["bag_recorder"] = {"out": str(recording.resolve())}
+    # The source waits for its sinks, or the first views are made twice.
+    sinks = 1 + ("composites" in plan)
+    flow: dict[str, Any] = {"window": window, "min_sinks": sinks}
+    if stage in ("image", "sector"):
+        plan["sub_aperture"] |= flow
+        flow = {"window": window, "min_sinks": 1}
+    plan["bag_player"] = {"bag": str(Path(bag).resolve()), "stage": stage, "rate": float(rate), **flow}
+    for name, own in overrides.items():
+        if name not in NODES:
+            raise errors.ParameterError(f"unknown node {name!r}; expected one of: {', '.join(NODES)}")
+        if name in plan:
+            plan[name] = {**plan[name], **own}
+    return plan
+
+
+@contextlib.contextmanager
+def _shown(progress: Callable[[int, int], None] | bool) -> Iterator[Callable[[int, int], None]]:
+    if callable(progress):
+        yield progress
+        return
+    if not progress:
+        yield lambda done, total: None
+        return
+    from tqdm import tqdm
+
+    with tqdm(total=None, unit="view", desc="replay", dynamic_ncols=True) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def _until_complete(
+    graph: Graph,
+    watcher: _Watcher,
+    stage: str,
+    progress: Callable[[int, int], None],
+    tell: Callable[[str], None],
+    stall_timeout_s: float,
+) -> None:
+    source = "sub_aperture" if stage in ("image", "sector") else stage
+    sender = "sub_aperture" if stage in ("image", "sector") else "bag_player"
+    told = 0
+    state: object = None
+    since = time.monotonic()
+    while True:
+        watcher.spin(0.1)
+        graph.watch()
+        for line in graph.deaths[told:]:
+            tell(f"{line}; it is started again")
+        told = len(graph.deaths)
+        for name, text in watcher.errors.items():
+            raise _error_of(name, text)
+        beat = watcher.beats.get((sender, source))
+        if beat is not None and beat.counts.get("total"):
+            progress(beat.counts["done"], beat.counts["total"])
+        if beat is not None and beat.counts.get("finished") and _sinks_complete(graph, watcher):
+            progress(beat.counts["done"], beat.counts["total"])
+            return
+        names = ("in", "sent", "done", "views")
+        changes = {k: (b.instance, *map(b.counts.get, names)) for k, b in watcher.beats.items()}
+        if changes != state:
+            state, since = changes, time.monotonic()
+        elif time.monotonic() - since > stall_timeout_s:
+            lines = [f"{name}: {process.last_line()}" for name, process in graph.processes.items()]
+            raise ReplayError(
+                f"nothing has happened for {stall_timeout_s:g} s; the nodes' last lines: {'; '.join(lines)}"
+            )
+
+
+def _sinks_complete(graph: Graph, watcher: _Watcher) -> bool:
+    for name in ("voxel_carver", "composites"):
+        if name not in graph.processes:
+            continue
+        beats = [b for (node, _), b in watcher.beats.items() if node == name]
+        if not beats or not all(b.counts.get("complete") for b in beats):
+            return False
+    return True
+
+
+def _error_of(node: str, text: str) -> CsasError:
+    """Make the error that a node named, of the kind that it had there."""
+    kind, _, message = text.partition(": ")
+    found = getattr(errors, kind, None)
+    if isinstance(found, type) and issubclass(found, CsasError):
+        return found(message)
+    return ReplayError(f"{node}: {text}")
+
+
+def _collect(
+    watcher: _Watcher, graph: Graph, stage: str, p: PipelineParameters, target: Target | None
+) -> ReplayResult:
+    from msg_adapters import ground_picture_from_msgs, mesh_from_msg, target_from_msg, voxel_grid_from_msgs
+    from msg_adapters import voxels_from_msg as read_voxels
+
+    result = ReplayResult(stage, target=target)
+    for (node, stream), beat in sorted(watcher.beats.items()):
+        if node in graph.processes:
+            restarts = graph.processes[node].restarts
+            result.nodes[node] = NodeReport(beat.counts.get("busy_ms", 0) / 1e3, restarts, dict(beat.counts))
+        if "total" in beat.counts and stream != "sector":
+            result.views_total, result.lost = beat.counts["total"], beat.counts["lost"]
+        if node == "voxel_carver":
+            result.views_used = beat.counts.get("views", 0)
+    result.rejected = sorted(watcher.rejected.values(), key=lambda r: (r.stamp_ns, r.aspect_deg))
+    topics: list[str] = []
+    if stage in ("image", "sector"):
+        topics.append("target")
+    if result.views_used:
+        topics += ["voxel_grid/image", "voxel_grid/camera_info", "voxels", "mesh"]
+    if result.nodes.get("composites") and result.nodes["composites"].counts.get("views"):
+        topics += [f"{s}/{t}" for s in ("multilook", "color_by_aspect") for t in ("image", "camera_info")]
+    got = watcher.collect(tuple(topics), 20.0)
+    if missing := [t for t in topics if t not in got]:
+        raise ReplayError(f"the result did not come on {', '.join(missing)} in 20 s")
+    if "target" in got:
+        box = target_from_msg(got["target"])
+        result.target = None if box is None else Target((box.centre_m[0], box.centre_m[1]), box.size_m)
+    if result.views_used:
+        _, volume, likelihood = voxel_grid_from_msgs(got["voxel_grid/image"], got["voxel_grid/camera_info"])
+        threshold = p.carving.threshold or object_threshold(likelihood, p.carving.method)
+        occupied = occupied_voxels(likelihood, threshold, p.carving.method)
+        views = np.zeros(likelihood.shape, np.uint16)
+        views[occupied] = read_voxels(got["voxels"]).views
+        result.grid = VoxelGrid(volume, likelihood, views, threshold, occupied, p.carving.method)
+        result.mesh = mesh_from_msg(got["mesh"])
+        result.dimensions = measure(result.mesh) if result.mesh is not None else None
+    for name in ("multilook", "color_by_aspect"):
+        if f"{name}/image" in got:
+            ground, pixels = ground_picture_from_msgs(got[f"{name}/image"], got[f"{name}/camera_info"], name)
+            result.composites[name], result.composites_grid = pixels, ground.grid
+    return result
