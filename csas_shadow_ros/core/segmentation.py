@@ -11,6 +11,7 @@ import math
 from dataclasses import replace
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,8 +30,6 @@ _MAX_RADIUS = 8
 _FLANK_PX = 2
 #: Smaller dark patches are speckle.
 _MIN_SHADOW_PIXELS = 25
-#: Patches of at least this fraction of the largest are shadows of the target's outline.
-_LARGE_PATCH = 0.3
 
 
 def dark_pixels(levels: Levels, info: ViewInfo) -> NDArray[np.bool_]:
@@ -115,38 +114,45 @@ def _of_target(
     keep[hit] = True
     keep[0] = False
     keep &= stats[:, cv2.CC_STAT_AREA] >= _MIN_SHADOW_PIXELS
-    return keep[labels]
+    return np.asarray(keep[labels], dtype=np.bool_)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _mark_before(
+    shadow: NDArray[np.bool_], edge: NDArray[np.bool_], flank: int, out: NDArray[np.bool_]
+) -> None:  # pragma: no cover
+    """Mark, up-range of every stretch of shadow in every column, what an echo leads up to."""
+    rows, cols = shadow.shape
+    for j in range(cols):
+        start = -1
+        for i in range(rows + 1):
+            dark = i < rows and shadow[i, j]
+            if dark and start < 0:
+                start = i
+            elif not dark and start >= 0:
+                reach = max(0, start - (i - start))
+                begin = max(reach, start - flank)
+                for k in range(reach, start):
+                    if edge[k, j]:
+                        begin = min(begin, k)
+                        break
+                for k in range(begin, start):
+                    out[k, j] = True
+                start = -1
 
 
 def _before_shadow(shadow: NDArray[np.bool_], echo: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mark the pixels between the target's echo and its shadow: the target covers them.
 
     The shadow hides the seabed from the target's foot on. Between the foot and where the view turns
-    dark lies the target's own echo: a bright edge towards the sonar, then often a top as faint as the seabed.
-    In each column, all from the farthest echo (no farther up-range than the shadow is long) to the
-    shadow is left open. Only the large patches count: a small one may be a hole in the target (a
-    tyre's), with more of its echo behind.
+    dark lies the target's own echo: a bright edge towards the sonar, then often a top as faint as the
+    seabed. In each column, up-range of each stretch of shadow, all from the farthest echo (no farther than
+    the stretch is long) is left open; where no echo is seen, only the shadow's flank is.
     """
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(shadow.view(np.uint8), connectivity=8)
-    unknown = np.zeros(shadow.shape, bool)
-    if count < 2:
-        return unknown
     # An edge that glitters has dark columns in it: its neighbours speak for them.
     edge = cv2.dilate(echo.view(np.uint8), np.ones((1, 5), np.uint8)).view(bool)
-    areas = stats[1:, cv2.CC_STAT_AREA]
-    for label in np.flatnonzero(areas >= _LARGE_PATCH * areas.max()) + 1:
-        left, top, width, height = stats[label, :4]
-        window = (slice(0, top + height), slice(left, left + width))
-        patch = labels[top : top + height, window[1]] == label
-        filled = patch.any(axis=0)
-        first = patch.argmax(axis=0)
-        length = height - patch[::-1].argmax(axis=0) - first
-        first = first + top
-        rows = np.arange(top + height)[:, None]
-        zone = filled & (rows < first) & (rows >= first - length)
-        seen = edge[window] & zone
-        begin = np.where(seen.any(axis=0), seen.argmax(axis=0), first - _FLANK_PX)
-        unknown[window] |= zone & (rows >= begin)
+    unknown = np.zeros(shadow.shape, bool)
+    _mark_before(shadow, edge, _FLANK_PX, unknown)
     return unknown
 
 
