@@ -1,0 +1,621 @@
+"""The command line: ``csas-shadow simulate | check | info | run | replay``."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from . import __version__
+from .core.errors import CsasError, ParameterError
+from .core.parameters import STAGES, PipelineParameters
+
+PROGRAM = "csas-shadow"
+OK, FAILED, USAGE = 0, 1, 2
+
+_DESCRIPTION = """\
+Shadows of a circular synthetic aperture sonar (CSAS) run, as pictures and as a 3-D shape.
+
+A run is a rosbag2 directory with the full-circle complex image (/csas/image and /csas/camera_info) and
+the sonar's track (/csas/track). Lengths are metres, angles degrees, frequencies Hz. The scene frame has
+x east, y north, z up, z = 0 on the seabed."""
+
+_EXAMPLES = """\
+a first try, from nothing to a 3-D shape (half a minute):
+  csas-shadow simulate box_run --profile tiny --target box
+  csas-shadow check box_run
+  csas-shadow run box_run --out box_results --step-deg 5
+  csas-shadow info box_results
+
+exit codes: 0 done, 1 it failed (one line says why), 2 the command line is wrong."""
+
+
+class _Help(argparse.RawDescriptionHelpFormatter):
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=34, width=100)
+
+
+class Console:
+    """Where things are said: results on stdout, all else on stderr."""
+
+    def __init__(self, *, quiet: bool = False, as_json: bool = False) -> None:
+        self.quiet, self.as_json = quiet, as_json
+
+    def notice(self, line: str) -> None:
+        """Say something in passing."""
+        if not self.quiet:
+            print(f"{PROGRAM}: {line}", file=sys.stderr)
+
+    def result(self, text: str, document: Any) -> None:
+        """Give the result: the document if JSON was asked for, else the text."""
+        if self.as_json:
+            print(json.dumps(document, indent=2, allow_nan=False))
+        else:
+            print(text.rstrip("\n"))
+
+    @contextlib.contextmanager
+    def bar(self, what: str) -> Iterator[Callable[[int, int], None]]:
+        """Give a function of (done, total) that moves a bar; none unless stderr is a terminal."""
+        from tqdm import tqdm
+
+        hidden = self.quiet or not sys.stderr.isatty()
+        with tqdm(desc=what, unit="", file=sys.stderr, disable=hidden, leave=False) as bar:
+
+            def move(done: int, total: int) -> None:
+                bar.total = total
+                bar.update(done - bar.n)
+
+            yield move
+
+
+# -- options ----------------------------------------------------------------------------------------
+
+
+def _common(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("output")
+    group.add_argument("--json", action="store_true", help="JSON alone on stdout")
+    group.add_argument("-q", "--quiet", action="store_true", help="no progress and no notices")
+    group.add_argument("--debug", action="store_true", help="tracebacks of errors")
+
+
+def _number_help(field: dataclasses.Field[Any]) -> str:
+    """Return a parameter's help: what it is, its unit, its bounds and its default."""
+    meta = field.metadata
+    unit = f" {meta['unit']}" if meta["unit"] else ""
+    default = field.default
+    parts = []
+    if meta["low"] is not None:
+        parts.append(f"{meta['low']:g} to {meta['high']:g}{unit}")
+    if isinstance(default, tuple):
+        default = " ".join(f"{v:g}" for v in default)
+    elif isinstance(default, bool):
+        default = "on" if default else "off"
+    elif isinstance(default, float):
+        default = f"{default:g}"
+    parts.append(f"default {default}{unit if meta['low'] is not None else ''}")
+    return f"{meta['doc']} ({'; '.join(parts)})".replace("%", "%%")
+
+
+def add_parameters(parser: argparse.ArgumentParser, stages: dict[str, type[Any]]) -> None:
+    """Add an option for every field of parameter dataclasses, a group each."""
+    for kind in stages.values():
+        group = parser.add_argument_group((kind.__doc__ or "").splitlines()[0].rstrip("."))
+        for field in dataclasses.fields(kind):
+            flag = "--" + field.name.replace("_", "-")
+            options: dict[str, Any] = {
+                "default": None,
+                "help": _number_help(field),
+                "dest": f"p_{field.name}",
+            }
+            meta, default = field.metadata, field.default
+            unit = str(meta["unit"] or "n").replace("/", "").upper()
+            if isinstance(default, bool):
+                options["action"] = argparse.BooleanOptionalAction
+            elif isinstance(default, str):
+                options["choices"] = meta["choices"] or None
+            elif isinstance(default, tuple):
+                options.update(type=float, nargs=meta["length"], metavar=unit)
+            else:
+                options.update(type=int if isinstance(default, int) else float, metavar=unit)
+            group.add_argument(flag, **options)
+
+
+def given_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the parameters that the command line gives, by name."""
+    return {
+        name[2:]: tuple(value) if isinstance(value, list) else value
+        for name, value in vars(arguments).items()
+        if name.startswith("p_") and value is not None
+    }
+
+
+def parameters_of(arguments: argparse.Namespace) -> PipelineParameters:
+    """Return the parameters of the file, with those of the command line over them.
+
+    Raises
+    ------
+    ParameterError
+        If one is unknown or out of range.
+    """
+    from .parameter_file import pipeline_parameters, read_parameter_file
+
+    values = read_parameter_file(arguments.params) if arguments.params else {}
+    values.update(given_parameters(arguments))
+    if "position_m" in values and "target" not in values:
+        values["target"] = "given"  # a position is given for no other purpose
+    return pipeline_parameters(values)
+
+
+def _results_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("results")
+    group.add_argument("--out", required=True, metavar="DIR", help="results folder to make")
+    group.add_argument("--overwrite", action="store_true", help="replace a results folder that is there")
+    group.add_argument("--no-bag", action="store_true", help="no result.mcap (it holds every view)")
+    group.add_argument("--no-figures", action="store_true", help="no figures/")
+
+
+def _parameter_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--params",
+        metavar="YAML",
+        help="parameter file in ROS 2's layout, as config/csas_shadow.yaml; options override it",
+    )
+    add_parameters(parser, dict(STAGES))
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Make the parser of the whole command line."""
+    parser = argparse.ArgumentParser(
+        PROGRAM, description=_DESCRIPTION, epilog=_EXAMPLES, formatter_class=_Help, allow_abbrev=False
+    )
+    parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def add(name: str, summary: str, examples: str, function: Callable[..., int]) -> argparse.ArgumentParser:
+        sub = commands.add_parser(
+            name,
+            help=summary,
+            description=summary[0].upper() + summary[1:] + ".",
+            epilog=f"examples:\n{examples}",
+            formatter_class=_Help,
+            allow_abbrev=False,
+        )
+        sub.set_defaults(function=function)
+        return sub
+
+    _add_simulate(add)
+    check = add(
+        "check",
+        "say whether a bag can be processed, what is wrong with it and what to do about it",
+        "  csas-shadow check box_run\n  csas-shadow check box_run --json > report.json\n\n"
+        "exit code 1 if the bag does not honour the topic contract.",
+        _check,
+    )
+    check.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
+    check.add_argument("--namespace", help="namespace of its topics (found by itself)")
+    _common(check)
+    info = add(
+        "info",
+        "tell what a bag or a results folder holds",
+        "  csas-shadow info box_run\n  csas-shadow info box_results",
+        _info,
+    )
+    info.add_argument("path", metavar="BAG|DIR", help="a bag, or a results folder")
+    info.add_argument("--namespace", help="namespace of the bag's topics (found by itself)")
+    _common(info)
+    _add_run(add)
+    _add_replay(add)
+    return parser
+
+
+def _add_simulate(add: Callable[..., argparse.ArgumentParser]) -> None:
+    from .simulation import PROFILES, TARGETS
+
+    p = add(
+        "simulate",
+        "make a bag of a simulated run, with its truth beside it",
+        "  csas-shadow simulate box_run --profile tiny\n"
+        "  csas-shadow simulate frame_run --target frame_grid --heading-deg 30 --encoding 16SC2\n"
+        "  csas-shadow simulate hard_run --contrast-db 6 --track-wobble-m 0.5 --missing-arc 40 75\n"
+        "  csas-shadow simulate mine_run --target mine.stl --position 0.5 -0.3\n\n"
+        "writes OUT_BAG, OUT_BAG.truth.stl and OUT_BAG.truth.json. Profile samdis takes minutes and 2 GB.",
+        _simulate,
+    )
+    p.add_argument("out_bag", metavar="OUT_BAG", help="bag to make (a rosbag2 directory)")
+    p.add_argument("--overwrite", action="store_true", help="replace a bag that is there")
+    p.add_argument(
+        "--profile",
+        choices=list(PROFILES),
+        default="standard",
+        help="image, circle and band (default standard)",
+    )
+    p.add_argument(
+        "--target",
+        default="box",
+        metavar="NAME|MESH",
+        help=f"{', '.join(TARGETS)}; or a closed mesh file in metres (default box)",
+    )
+    p.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
+    p.add_argument(
+        "--position", type=float, nargs=2, default=(0.0, 0.0), metavar=("X", "Y"), help="of the target (m)"
+    )
+    p.add_argument(
+        "--heading-deg", type=float, default=0.0, metavar="DEG", help="turn of the target, counter-clockwise"
+    )
+    p.add_argument(
+        "--encoding",
+        choices=("32FC2", "64FC2", "16SC2", "8SC2"),
+        default="32FC2",
+        help="pixels of the image: float32, float64, int16 or int8 pairs (default 32FC2)",
+    )
+    p.add_argument(
+        "--spectrum-sign",
+        type=int,
+        choices=(1, -1),
+        default=1,
+        help="phase convention of the image (default 1)",
+    )
+    p.add_argument(
+        "--echo-db", type=float, default=12.0, metavar="DB", help="target's echo over the seabed (default 12)"
+    )
+    p.add_argument("--clockwise", action="store_true", help="the sonar goes round clockwise")
+    p.add_argument(
+        "--start-aspect-deg",
+        type=float,
+        default=0.0,
+        metavar="DEG",
+        help="aspect of the first pose (default 0)",
+    )
+    faults = p.add_argument_group("faults")
+    faults.add_argument(
+        "--contrast-db", type=float, default=15.0, metavar="DB", help="seabed over shadow level (default 15)"
+    )
+    faults.add_argument(
+        "--track-wobble-m",
+        type=float,
+        default=0.0,
+        metavar="M",
+        help="rms departure from the circle, reported",
+    )
+    faults.add_argument(
+        "--height-error",
+        type=float,
+        default=0.0,
+        metavar="F",
+        help="the track reports heights (1 + F) times true",
+    )
+    faults.add_argument(
+        "--missing-arc",
+        type=float,
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("START", "STOP"),
+        help="arc without imagery and poses, degrees counter-clockwise; may be repeated",
+    )
+    faults.add_argument(
+        "--phase-error-rad", type=float, default=0.0, metavar="RAD", help="rms residual phase error"
+    )
+    faults.add_argument(
+        "--quadratic-phase-rad",
+        type=float,
+        default=0.0,
+        metavar="RAD",
+        help="parabolic phase error of each arc",
+    )
+    faults.add_argument(
+        "--quadratic-arc-deg",
+        type=float,
+        default=12.0,
+        metavar="DEG",
+        help="length of those arcs (default 12)",
+    )
+    faults.add_argument("--wrong-sign", action="store_true", help="the bag states the opposite spectrum sign")
+    faults.add_argument(
+        "--sound-speed-error",
+        type=float,
+        default=0.0,
+        metavar="F",
+        help="the bag states (1 + F) times the true c",
+    )
+    faults.add_argument(
+        "--seabed-slope-db",
+        type=float,
+        default=0.0,
+        metavar="DB",
+        help="seabed level rises so much west to east",
+    )
+    shape = p.add_argument_group("image and circle, instead of the profile's")
+    for flag, kind, unit, text in (
+        ("--rows", int, "N", "rows of the image"),
+        ("--cols", int, "N", "columns of the image"),
+        ("--spacing-m", float, "M", "pixel"),
+        ("--radius-m", float, "M", "radius of the circle"),
+        ("--height-m", float, "M", "height of the sonar over the seabed"),
+        ("--centre-frequency-hz", float, "HZ", "centre frequency"),
+        ("--bandwidth-hz", float, "HZ", "bandwidth"),
+        ("--sound-speed-mps", float, "MS", "sound speed"),
+    ):
+        dest = "profile_" + flag[2:].replace("-", "_")
+        shape.add_argument(flag, type=kind, metavar=unit, default=None, dest=dest, help=text)
+    _common(p)
+
+
+def _add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
+    from .process import START_FROM
+
+    p = add(
+        "run",
+        "reconstruct the target of a bag, in this process, and write a results folder",
+        "  csas-shadow run box_run --out box_results\n"
+        "  csas-shadow run box_run --out quick --step-deg 5 --voxel-size-m 0.04 --no-bag\n"
+        "  csas-shadow run box_run --out by_hand --position-m 0.5 -0.3 --size-m 2 2 0.8\n"
+        "  csas-shadow run other_run --out flipped --spectrum-sign -1\n"
+        "  csas-shadow run views --out carved --start-from likelihood --target given --size-m 2 2 0.8\n\n"
+        "DIR holds grid.npz, mesh.stl .ply .obj .glb, report.json, summary.txt, result.mcap and figures/.\n"
+        "A seabed without an object is a result like any other: it is said so, and the exit code is 0.",
+        _run,
+    )
+    p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
+    p.add_argument("--namespace", help="namespace of its topics (found by itself)")
+    p.add_argument(
+        "--start-from",
+        choices=START_FROM,
+        default="auto",
+        help="image (or sectors) and track, or views of a stage; auto: the first that the bag holds",
+    )
+    p.add_argument(
+        "--spectrum-sign",
+        type=int,
+        choices=(1, -1),
+        default=None,
+        help="instead of the one that the bag states",
+    )
+    p.add_argument("--workers", type=int, default=2, metavar="N", help="threads (default 2)")
+    _results_options(p)
+    _parameter_options(p)
+    _common(p)
+
+
+def _add_replay(add: Callable[..., argparse.ArgumentParser]) -> None:
+    p = add(
+        "replay",
+        "reconstruct the target of a bag through the ROS 2 nodes, and write the same results folder",
+        "  csas-shadow replay box_run --out box_results\n\n"
+        "starts every node as a process of its own, as `ros2 launch` does, and needs ROS 2 (rclpy).",
+        _replay,
+    )
+    p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
+    _results_options(p)
+    _parameter_options(p)
+    _common(p)
+
+
+# -- commands ---------------------------------------------------------------------------------------
+
+
+def _simulate(arguments: argparse.Namespace, console: Console) -> int:
+    from .simulation import Faults, get_profile, simulate_bag
+
+    overrides = {
+        name.removeprefix("profile_"): value
+        for name, value in vars(arguments).items()
+        if name.startswith("profile_") and value is not None
+    }
+    faults = Faults(
+        contrast_db=arguments.contrast_db,
+        track_wobble_m=arguments.track_wobble_m,
+        height_error=arguments.height_error,
+        missing_arcs_deg=tuple(tuple(arc) for arc in arguments.missing_arc),
+        phase_error_rad=arguments.phase_error_rad,
+        quadratic_phase_rad=arguments.quadratic_phase_rad,
+        quadratic_arc_deg=arguments.quadratic_arc_deg,
+        wrong_sign=arguments.wrong_sign,
+        sound_speed_error=arguments.sound_speed_error,
+        seabed_slope_db=arguments.seabed_slope_db,
+    )
+    start = time.perf_counter()
+    with console.bar("simulating") as bar:
+        run = simulate_bag(
+            arguments.out_bag,
+            get_profile(arguments.profile, **overrides),
+            arguments.target,
+            seed=arguments.seed,
+            position_m=tuple(arguments.position),
+            heading_deg=arguments.heading_deg,
+            faults=faults,
+            spectrum_sign=arguments.spectrum_sign,
+            echo_db=arguments.echo_db,
+            clockwise=arguments.clockwise,
+            start_aspect_deg=arguments.start_aspect_deg,
+            progress=bar,
+            encoding=arguments.encoding,
+            overwrite=arguments.overwrite,
+        )
+    out = Path(arguments.out_bag)
+    length, width, height = run.truth.dims_m
+    grid = run.image.grid
+    document = {
+        "bag": str(out.resolve()),
+        "truth": [str(out.with_name(f"{out.name}.truth.{kind}").resolve()) for kind in ("stl", "json")],
+        "target": run.truth.name,
+        "dims_m": [length, width, height],
+        "position_m": list(run.truth.position_m),
+        "profile": arguments.profile,
+        "encoding": arguments.encoding,
+        "rows": grid.rows,
+        "cols": grid.cols,
+        "poses": len(run.track),
+        "seconds": time.perf_counter() - start,
+    }
+    text = (
+        f"{out}: {run.truth.name}"
+        + (f" {length:.2f} x {width:.2f} x {height:.2f} m" if height else "")
+        + f", image {grid.rows} x {grid.cols} of {grid.spacing_m * 1e3:g} mm as {arguments.encoding},"
+        f" {len(run.track)} poses; {document['seconds']:.1f} s"
+    )
+    console.result(text, document)
+    return OK
+
+
+def _check(arguments: argparse.Namespace, console: Console) -> int:
+    from .bags import check_bag
+
+    report = check_bag(arguments.bag, arguments.namespace)
+    console.result(str(report), report.as_dict())
+    return OK if report.ok else FAILED
+
+
+def _info(arguments: argparse.Namespace, console: Console) -> int:
+    from .results import is_results_folder, read_report, summary
+
+    if is_results_folder(arguments.path):
+        report = read_report(arguments.path)
+        text = summary(report) + f"from {report['input'].get('path', '?')}, started from {report['stage']}\n"
+        text += "files: " + ", ".join(f for f in report["files"] if "/" not in f)
+        drawn = [f for f in report["files"] if f.startswith("figures/")]
+        console.result(text + f", {len(drawn)} figures", report)
+        return OK
+    from .bags import read_run
+    from .process import describe_run, stages_of, topic_sizes
+    from .results import read_truth
+    from .results.report import json_ready
+
+    run = read_run(arguments.path, arguments.namespace)
+    about = describe_run(run)
+    for topic, size in topic_sizes(run).items():
+        about["topics"][topic]["bytes"] = size
+    truth = read_truth(arguments.path)
+    about["truth"] = None
+    if truth is not None:
+        about["truth"] = {"mesh": str(truth.path), "dimensions": truth.dimensions, "record": truth.record}
+    about["start_from"] = stages_of(run)
+    about["problems"] = [str(problem) for problem in run.problems]
+    about = json_ready(about)
+    console.result(_bag_text(about), about)
+    return OK
+
+
+def _size(count: float) -> str:
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.2f} GB"
+
+
+def _bag_text(about: dict[str, Any]) -> str:
+    lines = [f"{about['path']}: {about['messages']} messages, {_size(about['bytes'])}", ""]
+    width = max((len(name) for name in about["topics"]), default=0)
+    for name, topic in about["topics"].items():
+        size = _size(topic.get("bytes", 0))
+        lines.append(f"  {name:<{width}}  {topic['messages']:>6}  {size:>9}  {topic['type']}")
+    lines.append("")
+    if image := about["image"]:
+        e = image["extent_m"]
+        lines.append(
+            f"image   {image['rows']} x {image['cols']} pixels of {image['spacing_m'] * 1e3:g} mm:"
+            f" x {e['left']:.2f} to {e['right']:.2f} m, y {e['bottom']:.2f} to {e['top']:.2f} m"
+        )
+        lines.append(
+            f"band    {image['centre_frequency_hz'] / 1e3:g} kHz ± {image['bandwidth_hz'] / 2e3:g} kHz,"
+            f" sound speed {image['sound_speed_mps']:g} m/s, spectrum sign {image['spectrum_sign']:+d}"
+        )
+    if track := about["track"]:
+        lines.append(
+            f"track   {track['poses']} poses over {track['coverage_deg']:.1f}° {track['direction']}, radius"
+            f" {track['radius_m']:.2f} m, height {track['height_m']:.2f} m,"
+            f" grazing {track['grazing_deg']:.1f}°"
+        )
+        if track["gaps"]:
+            lines.append(f"        missing: {', '.join(track['gaps'][:8])}")
+    if truth := about["truth"]:
+        d = truth["dimensions"]
+        what = truth["record"].get("name", "target")
+        lines.append(
+            f"truth   {what}"
+            + (f" {d['length_m']:.3f} x {d['width_m']:.3f} x {d['height_m']:.3f} m" if d else ": no object")
+            + f" ({truth['mesh']})"
+        )
+    starts = ", ".join(about["start_from"]) or "nothing: see `csas-shadow check`"
+    lines.append(f"a run can start from: {starts}")
+    lines += [f"problem: {problem}" for problem in about["problems"]]
+    return "\n".join(lines)
+
+
+def _run(arguments: argparse.Namespace, console: Console) -> int:
+    from .process import process_bag
+
+    parameters = parameters_of(arguments)
+    if arguments.workers < 1:
+        raise ParameterError(f"workers is {arguments.workers}; expected 1 or more")
+    with console.bar("views") as bar:
+        report = process_bag(
+            arguments.bag,
+            arguments.out,
+            parameters,
+            start_from=arguments.start_from,
+            spectrum_sign=arguments.spectrum_sign,
+            namespace=arguments.namespace,
+            overwrite=arguments.overwrite,
+            write_bag=not arguments.no_bag,
+            figures=not arguments.no_figures,
+            workers=arguments.workers,
+            command=arguments.command_line,
+            progress=bar,
+            notice=console.notice,
+        )
+    _give_report(arguments, console, report)
+    return OK
+
+
+def _give_report(arguments: argparse.Namespace, console: Console, report: dict[str, Any]) -> None:
+    from .results import summary
+
+    console.result(f"{summary(report)}results: {arguments.out}", report)
+
+
+def _replay(arguments: argparse.Namespace, console: Console) -> int:
+    raise CsasError("replay is not there yet")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Returns
+    -------
+    int
+        0 done, 1 failed; a wrong command line exits with 2.
+    """
+    given = list(sys.argv[1:] if argv is None else argv)
+    arguments = build_parser().parse_args(given)
+    arguments.command_line = [PROGRAM, *given]
+    console = Console(quiet=arguments.quiet, as_json=arguments.json)
+    try:
+        return int(arguments.function(arguments, console))
+    except CsasError as error:
+        if arguments.debug:
+            raise
+        print(f"{PROGRAM}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return FAILED
+    except BrokenPipeError:
+        # The reader of our output has gone, as `head` does.
+        sys.stderr.close()
+        return FAILED
+    except KeyboardInterrupt:
+        print(f"{PROGRAM}: error: interrupted", file=sys.stderr)
+        return FAILED
+
+
+def _entry() -> NoReturn:
+    sys.exit(main())
+
+
+if __name__ == "__main__":
+    _entry()

@@ -1,0 +1,272 @@
+"""A bag in, a results folder out, in one process."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from .bags import BagReader, Run, read_run
+from .core.errors import BagError, CsasError, ParameterError
+from .core.geometry import CoherentImage, Track, View
+from .core.parameters import PipelineParameters
+from .core.pipeline import Result
+from .core.pipeline import run as run_pipeline
+from .core.stages import STAGES, run_views, with_spectrum_sign
+from .results import Context, ResultsWriter, read_truth
+
+#: What a run can start from; auto takes the first that the bag holds.
+START_FROM = ("auto", "image", *STAGES)
+
+Progress = Callable[[int, int], None]
+Notice = Callable[[str], None]
+
+
+def _ignore(_: str) -> None:
+    return None
+
+
+def process_bag(
+    bag: str | Path,
+    out: str | Path,
+    parameters: PipelineParameters | None = None,
+    *,
+    start_from: str = "auto",
+    spectrum_sign: int | None = None,
+    namespace: str | None = None,
+    overwrite: bool = False,
+    write_bag: bool = True,
+    figures: bool = True,
+    workers: int = 2,
+    command: Sequence[str] = (),
+    progress: Progress | None = None,
+    notice: Notice = _ignore,
+) -> dict[str, Any]:
+    """Reconstruct the target of a bag and write its results folder.
+
+    Parameters
+    ----------
+    bag : path-like
+        A rosbag2 directory or a lone storage file.
+    out : path-like
+        Results folder to make.
+    parameters : PipelineParameters
+        Parameters of every stage.
+    start_from : str
+        ``image`` (or sectors) with the track, views of a stage, or ``auto``: the first that is there.
+    spectrum_sign : int, optional
+        +1 or -1 instead of what the bag states; said in a notice and in the report.
+    namespace : str, optional
+        Namespace of the topics; found by itself if not given.
+    overwrite, write_bag, figures
+        See `ResultsWriter`.
+    workers : int
+        Threads.
+    command : sequence of str
+        Command line, for the report.
+    progress : callable, optional
+        Called with (views done, views in all).
+    notice : callable
+        Called with each line that a user should see.
+
+    Returns
+    -------
+    dict
+        The report.
+
+    Raises
+    ------
+    CsasError
+        If the bag, a parameter or the folder is not usable.
+    """
+    p = parameters or PipelineParameters()
+    with ResultsWriter(out, overwrite=overwrite, bag=write_bag, figures=figures) as writer:
+        began = time.perf_counter()
+        run = read_run(bag, namespace)
+        truth = read_truth(bag)
+        stage = choose_start(run, start_from)
+        context = Context(p, command, stage=stage, truth=truth, spectrum_sign_override=spectrum_sign)
+        context.timings_s["read"] = time.perf_counter() - began
+        if stage == "image":
+            result = _from_image(run, context, writer, workers, progress, notice)
+        else:
+            result = _from_views(run, context, writer, workers, progress, notice)
+        context.timings_s["write_views"] = writer.view_seconds
+        result.timings_s["views"] = max(result.timings_s.get("views", 0.0) - writer.view_seconds, 0.0)
+        context.problems = [str(problem) for problem in run.problems]
+        for problem in context.problems:
+            notice(f"left out: {problem}")
+        context.input = describe_run(run)
+        return writer.finish(result, context)
+
+
+def choose_start(run: Run, start_from: str = "auto") -> str:
+    """Say what a run starts from: ``image`` or one of the stages.
+
+    Raises
+    ------
+    BagError
+        If the bag does not hold it, or holds nothing to start from.
+    ParameterError
+        If `start_from` is unknown.
+    """
+    if start_from not in START_FROM:
+        raise ParameterError(f"start_from is {start_from!r}; expected one of: {', '.join(START_FROM)}")
+    has_image = run.image is not None or bool(run.counts.get("sector"))
+    stages = [stage for stage in STAGES if run.counts.get(stage)]
+    if start_from == "auto":
+        if has_image and run.track is not None:
+            return "image"
+        if stages:
+            return stages[0]
+        if not has_image:
+            run.coherent_image()  # raises, naming what is wrong with the image
+        run.require_track()
+    if start_from != "image" and start_from not in stages:
+        held = ", ".join(stages) or "none"
+        raise BagError(f"{run.path} holds no {start_from} views; stages that it holds: {held}")
+    return start_from
+
+
+def _from_image(
+    run: Run, context: Context, writer: ResultsWriter, workers: int, progress: Progress | None, notice: Notice
+) -> Result:
+    began = time.perf_counter()
+    image, track = run.coherent_image(), run.require_track()
+    context.timings_s["read"] += time.perf_counter() - began
+    sign = context.spectrum_sign_override
+    if sign is not None:
+        notice(
+            f"spectrum sign overridden: the bag states {image.acoustics.spectrum_sign:+d}, {sign:+d} is used"
+        )
+        image = replace(image, acoustics=replace(image.acoustics, spectrum_sign=sign))
+    context.image, context.track = image, track
+    as_recorded = sign is None and run.image is not None
+    writer.write_source(image, track, BagReader(run.path, run.namespace) if as_recorded else None)
+    return run_pipeline(
+        image, track, context.parameters, progress=progress, on_view=writer.add_view, workers=workers
+    )
+
+
+def _from_views(
+    run: Run, context: Context, writer: ResultsWriter, workers: int, progress: Progress | None, notice: Notice
+) -> Result:
+    stage, sign = context.stage, context.spectrum_sign_override
+    context.track = run.track
+    notice(f"starting from the bag's {stage} views ({run.counts[stage]})")
+    if sign is not None:
+        notice(f"spectrum sign of the views overridden: {sign:+d} is used")
+    writer.write_source(None, run.track)
+
+    def views() -> Iterator[View]:
+        for view in run.views(stage):
+            yield view if sign is None else with_spectrum_sign(view, sign)
+
+    return run_views(
+        views,
+        stage,
+        context.parameters,
+        total=run.counts[stage],
+        progress=progress,
+        on_view=writer.add_view,
+        workers=workers,
+    )
+
+
+def describe_image(image: CoherentImage) -> dict[str, Any]:
+    """Return an image's size and band."""
+    grid, acoustics = image.grid, image.acoustics
+    return {
+        "rows": grid.rows,
+        "cols": grid.cols,
+        "spacing_m": grid.spacing_m,
+        "extent_m": {
+            "left": grid.extent_m[0],
+            "right": grid.extent_m[1],
+            "bottom": grid.extent_m[2],
+            "top": grid.extent_m[3],
+        },
+        "centre_frequency_hz": acoustics.centre_frequency_hz,
+        "bandwidth_hz": acoustics.bandwidth_hz,
+        "sound_speed_mps": acoustics.sound_speed_mps,
+        "spectrum_sign": acoustics.spectrum_sign,
+        "stamp_ns": image.stamp_ns,
+    }
+
+
+def describe_track(track: Track) -> dict[str, Any]:
+    """Return a track's size, circle and coverage."""
+    x, y, radius, height = track.circle
+    return {
+        "poses": len(track),
+        "centre_m": [x, y],
+        "radius_m": radius,
+        "height_m": height,
+        "grazing_deg": math.degrees(track.grazing_rad),
+        "coverage_deg": math.degrees(track.coverage_rad),
+        "gaps": [str(gap) for gap in track.gaps],
+        "duration_s": float(track.stamps_ns[-1] - track.stamps_ns[0]) * 1e-9,
+        "direction": "counter-clockwise" if track.aspects_rad[-1] > track.aspects_rad[0] else "clockwise",
+    }
+
+
+def describe_run(run: Run) -> dict[str, Any]:
+    """Describe a bag: its topics with counts, its files, image, band and track.
+
+    Returns
+    -------
+    dict
+        Ready for JSON.
+    """
+    reader = BagReader(run.path, run.namespace)
+    files = [run.path] if run.path.is_file() else sorted(p for p in run.path.iterdir() if p.is_file())
+    track = run.track
+    return {
+        "path": str(run.path.resolve()),
+        "namespace": run.namespace,
+        "messages": reader.message_count,
+        "topics": {
+            name: {"type": info.type_name, "messages": info.count}
+            for name, info in sorted(reader.topics.items())
+        },
+        "files": {p.name: p.stat().st_size for p in files},
+        "bytes": sum(p.stat().st_size for p in files),
+        "checksums": reader.has_checksums,
+        "metadata": _bag_metadata(run.path),
+        "image": None if run.image is None else describe_image(run.image),
+        "track": None if track is None else describe_track(track),
+    }
+
+
+def _bag_metadata(path: Path) -> dict[str, Any] | None:
+    """Return the bag's own metadata without its lists of topics, which are told elsewhere."""
+    try:
+        text = (path / "metadata.yaml").read_text(encoding="utf-8")
+        information = yaml.safe_load(text)["rosbag2_bagfile_information"]
+        return {k: v for k, v in information.items() if k not in ("topics_with_message_count", "files")}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def topic_sizes(run: Run) -> dict[str, int]:
+    """Return the bytes of the messages of each topic; reads the whole bag."""
+    sizes: dict[str, int] = {}
+    reader = BagReader(run.path, run.namespace)
+    for message in reader.messages():
+        sizes[message.topic] = sizes.get(message.topic, 0) + len(message.cdr)
+    return sizes
+
+
+def stages_of(run: Run) -> list[str]:
+    """Return what a run of this bag could start from."""
+    found = []
+    try:
+        found.append(choose_start(run))
+    except CsasError:
+        return []
+    return found + [stage for stage in STAGES if run.counts.get(stage) and stage not in found]

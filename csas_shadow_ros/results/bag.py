@@ -1,0 +1,135 @@
+"""The result as a bag: every topic of the contract, views written one by one as they are made."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+from msg_adapters.camera_info import GroundInfo
+from msg_adapters.mesh import mesh_to_msg
+from msg_adapters.messages import RosbagsMessages
+from msg_adapters.pairs import (
+    coherent_image_to_msgs,
+    ground_picture_to_msgs,
+    view_to_msgs,
+    voxel_grid_to_msgs,
+)
+from msg_adapters.target import TargetBox, target_to_msg
+from msg_adapters.topics import NAMESPACE, STREAMS, TOPICS, absolute_name
+from msg_adapters.track import track_to_msg
+from msg_adapters.voxels import voxels_to_msg
+
+from ..bags import BagReader, BagWriter
+from ..core.geometry import Acoustics, CoherentImage, Track, View
+from ..core.pipeline import Result
+
+_LATCHED = ("image", "camera_info", "track", "target", "mesh", "voxels")
+_LATCHED_STREAMS = ("multilook", "color_by_aspect", "voxel_grid")
+
+
+class ResultBag:
+    """Writes the bag of a result: a lone MCAP file that rosbag2 opens.
+
+    Parameters
+    ----------
+    folder : Path
+        Where to put ``result.mcap``.
+    """
+
+    FILE = "result.mcap"
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._factory = RosbagsMessages()
+        self._work = folder / ".bag"
+        self._writer = BagWriter(self._work, file_name=self.FILE)
+        self._acoustics: Acoustics | None = None
+        self._last_ns = 0
+        names = [*_LATCHED, *(f"{s}/{kind}" for s in _LATCHED_STREAMS for kind in ("image", "camera_info"))]
+        for name in names:
+            self._writer.add_topic(absolute_name(name), TOPICS[name].type_name, depth=1)
+
+    def _write(self, relative: str, message: Any, when_ns: int | None = None) -> None:
+        self._writer.write(absolute_name(relative), message, when_ns)
+
+    def write_source(
+        self, image: CoherentImage | None, track: Track | None, reader: BagReader | None = None
+    ) -> None:
+        """Write the image and the track; from a reader as they were recorded, byte for byte.
+
+        Parameters
+        ----------
+        image, track : CoherentImage, Track or None
+            What was processed.
+        reader : BagReader, optional
+            The bag they came from, if they are the bag's own (not a sum of sectors, no other sign).
+        """
+        if image is not None:
+            self._acoustics = image.acoustics
+            self._last_ns = image.stamp_ns
+        if track is not None:
+            self._last_ns = max(self._last_ns, int(track.stamps_ns[-1]))
+        if reader is not None:
+            for message in reader.messages(["image", "camera_info", "track"]):
+                relative = message.topic.removeprefix(f"{reader.namespace}/")
+                # Whatever the namespace of the recording, the result has the contract's.
+                self._writer.write(
+                    absolute_name(relative, NAMESPACE),
+                    message.cdr,
+                    message.log_time_ns,
+                    type_name=message.type_name,
+                )
+            return
+        if track is not None:
+            self._write("track", track_to_msg(self._factory, track), self._last_ns)
+        if image is not None:
+            picture, info = coherent_image_to_msgs(self._factory, image)
+            self._write("camera_info", info, self._last_ns)
+            self._write("image", picture, self._last_ns)
+
+    def write_view(self, view: View, stream_name: str) -> None:
+        """Write one view of a stream."""
+        picture, info = view_to_msgs(self._factory, view, stream_name)
+        self._write(STREAMS[stream_name].info_topic, info)
+        self._write(STREAMS[stream_name].image_topic, picture)
+        self._last_ns = max(self._last_ns, view.info.stamp_ns)
+        self._acoustics = self._acoustics or view.info.acoustics
+
+    def finish(self, result: Result) -> Path:
+        """Write composites, grid, voxels, mesh and target, and close.
+
+        Returns
+        -------
+        Path
+            The file.
+        """
+        factory, when = self._factory, self._last_ns
+        if result.composites is not None and result.composites.stamps and self._acoustics is not None:
+            info = GroundInfo(when, result.composites.grid, self._acoustics)
+            pictures = (
+                ("multilook", result.composites.multilook()),
+                ("color_by_aspect", result.composites.color_by_aspect()),
+            )
+            for name, pixels in pictures:
+                picture, camera = ground_picture_to_msgs(factory, pixels, info, name)
+                self._write(STREAMS[name].info_topic, camera)
+                self._write(STREAMS[name].image_topic, picture)
+        grid = result.grid
+        if grid is not None:
+            picture, camera = voxel_grid_to_msgs(factory, grid.volume, grid.likelihood, when)
+            self._write("voxel_grid/camera_info", camera)
+            self._write("voxel_grid/image", picture)
+            self._write("voxels", voxels_to_msg(factory, grid, when))
+        box = None if grid is None else TargetBox.of(grid.volume)
+        self._write("target", target_to_msg(factory, box, when))
+        self._write("mesh", mesh_to_msg(factory, result.mesh, when))
+        self._writer.close()
+        path = self._folder / self.FILE
+        self._writer.file.replace(path)
+        shutil.rmtree(self._work)
+        return path
+
+    def abandon(self) -> None:
+        """Close what has been written; the folder is not going to be kept."""
+        self._writer.close()

@@ -1,0 +1,309 @@
+"""What a run found, as one JSON document and as a table to read."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.metadata
+import json
+import math
+import platform
+import sys
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from ..core.geometry import CoherentImage, Track
+from ..core.mesh import Dimensions
+from ..core.parameters import PipelineParameters
+from ..core.pipeline import Result
+from ..core.volume import VoxelGrid
+from .truth import KnownTruth
+
+FORMAT = "csas_shadow_ros results 1"
+
+
+@dataclass(eq=False)
+class Context:
+    """What a report tells of a run besides its result.
+
+    Parameters
+    ----------
+    parameters : PipelineParameters
+        Parameters used.
+    command : sequence of str
+        Command line.
+    input : mapping
+        What the input bag is (`describe_input`).
+    stage : str
+        Where in the chain the run started: ``image`` or one of `core.stages.STAGES`.
+    image, track : CoherentImage, Track or None
+        What was processed.
+    spectrum_sign_override : int or None
+        The sign that replaced the stated one.
+    problems : sequence of str
+        What was wrong with the bag.
+    truth : KnownTruth or None
+        What is really there.
+    timings_s : dict
+        Seconds of the steps round the method.
+    """
+
+    parameters: PipelineParameters = field(default_factory=PipelineParameters)
+    command: Sequence[str] = ()
+    input: Mapping[str, Any] = field(default_factory=dict)
+    stage: str = "image"
+    image: CoherentImage | None = None
+    track: Track | None = None
+    spectrum_sign_override: int | None = None
+    problems: Sequence[str] = ()
+    truth: KnownTruth | None = None
+    timings_s: dict[str, float] = field(default_factory=dict)
+
+
+def json_ready(value: Any) -> Any:
+    """Return a value as JSON has it: NaN and infinities become null, arrays lists."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return json_ready(dataclasses.asdict(value))
+    if isinstance(value, Mapping):
+        return {str(k): json_ready(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | set):
+        return [json_ready(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return json_ready(value.tolist())
+    if isinstance(value, np.generic):
+        return json_ready(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python, of this package and of every library that is loaded."""
+    found = {"python": platform.python_version(), "csas_shadow_ros": __version__}
+    distributions = importlib.metadata.packages_distributions()
+    for module in {name.partition(".")[0] for name in sys.modules} - set(sys.stdlib_module_names):
+        # Of a package that is one compiled file, only its own name is known.
+        for name in distributions.get(module, [module]):
+            with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+                found.setdefault(name, importlib.metadata.version(name))
+    return dict(sorted(found.items(), key=lambda item: item[0].lower()))
+
+
+def _dimensions(d: Dimensions | None) -> dict[str, Any] | None:
+    if d is None:
+        return None
+    return {**dataclasses.asdict(d), "heading_deg": math.degrees(d.heading_rad)}
+
+
+def _grid(grid: VoxelGrid | None) -> dict[str, Any] | None:
+    if grid is None:
+        return None
+    unknown = int(np.count_nonzero(~np.isfinite(grid.likelihood)))
+    return {
+        "method": grid.method,
+        "threshold": grid.threshold,
+        "voxel_size_m": grid.volume.voxel_size_m,
+        "origin_m": grid.volume.origin_m,
+        "shape_zyx": grid.volume.shape,
+        "size_m": grid.volume.size_m,
+        "occupied_voxels": int(np.count_nonzero(grid.occupied)),
+        "unknown_voxels": unknown,
+        "occupied_volume_m3": float(np.count_nonzero(grid.occupied)) * grid.volume.voxel_size_m**3,
+    }
+
+
+def _levels(
+    levels: Mapping[int, tuple[float, float, bool]], aspects_deg: Mapping[int, float]
+) -> dict[str, Any]:
+    """Summarise σ_r, σ_s and contrast, overall and by view."""
+    views = [
+        {
+            "stamp_ns": stamp,
+            "aspect_deg": aspects_deg.get(stamp),
+            "sigma_r": sigma_r,
+            "sigma_s": sigma_r / contrast,
+            "contrast_db": 20.0 * math.log10(contrast),
+            "estimated": estimated,
+        }
+        for stamp, (sigma_r, contrast, estimated) in sorted(levels.items())
+    ]
+    overall: dict[str, Any] = {"views": len(views), "estimated": sum(bool(v["estimated"]) for v in views)}
+    for name in ("sigma_r", "sigma_s", "contrast_db"):
+        numbers = np.array([v[name] for v in views], dtype=np.float64)
+        quantiles = np.percentile(numbers, [0, 50, 100]) if len(numbers) else [math.nan] * 3
+        overall[name] = dict(zip(("min", "median", "max"), map(float, quantiles), strict=True))
+    return {"overall": overall, "by_view": views}
+
+
+def _sign(result: Result, context: Context) -> dict[str, Any]:
+    override = context.spectrum_sign_override
+    if result.sign is None:
+        why = "there is no image to check it on" if context.image is None else "check_sign is off"
+        stated = context.image.acoustics.spectrum_sign if context.image is not None else None
+        return {"stated": stated, "verdict": "not checked", "why": why, "override": override}
+    return {
+        "stated": result.sign.stated,
+        "verdict": result.sign.verdict,
+        "why": str(result.sign),
+        "stated_evidence": result.sign.stated_evidence,
+        "other_evidence": result.sign.other_evidence,
+        "override": override,
+    }
+
+
+def build_report(
+    result: Result,
+    context: Context,
+    *,
+    aspects_deg: Mapping[int, float],
+    scores: Mapping[str, float] | None,
+    other: Dimensions | None,
+    files: Sequence[str],
+    figures_left_out: Mapping[str, str],
+) -> dict[str, Any]:
+    """Make the report; everything in it is JSON as it stands.
+
+    Parameters
+    ----------
+    result, context : Result, Context
+        What was found, and of what.
+    aspects_deg : mapping of int to float
+        Aspect of each view by its stamp.
+    scores : mapping, optional
+        Against the truth (`truth.score`).
+    other : Dimensions, optional
+        Measures by the other method.
+    files : sequence of str
+        Files of the folder.
+    figures_left_out : mapping
+        Why figures are not there.
+    """
+    used, lost = result.views_used, len(result.rejected)
+    truth = None
+    if context.truth is not None:
+        truth = {
+            "mesh": str(context.truth.path),
+            "object": context.truth.dimensions is not None,
+            "dimensions": _dimensions(context.truth.dimensions),
+            "scores": dict(scores) if scores else None,
+            "record": context.truth.record,
+        }
+    found = result.mesh is not None
+    composed = len(result.composites.stamps) if result.composites is not None else 0
+    report = {
+        "format": FORMAT,
+        "object": found,
+        "verdict": "object found" if found else no_object_reason(result),
+        "method": context.parameters.carving.method,
+        "dimensions": _dimensions(result.dimensions),
+        "threshold": result.grid.threshold if result.grid is not None else None,
+        "target": result.target,
+        "grid": _grid(result.grid),
+        "other_method": {"grid": _grid(result.other_grid), "dimensions": _dimensions(other)},
+        "truth": truth,
+        "views": {
+            "in": max(used + lost, composed),
+            "used": used,
+            "rejected": lost,
+            "reasons": dict(Counter(_kind(r) for r in result.rejected.values()).most_common()),
+            "rejected_by_aspect_deg": {f"{a:g}": r for a, r in sorted(result.rejected.items())},
+        },
+        "levels": _levels(result.levels, aspects_deg),
+        "spectrum_sign": _sign(result, context),
+        "timings_s": {**result.timings_s, **context.timings_s},
+        "stage": context.stage,
+        "input": context.input,
+        "problems": list(context.problems),
+        "parameters": dataclasses.asdict(context.parameters),
+        "command": list(context.command),
+        "versions": versions(),
+        "platform": platform.platform(),
+        "files": sorted(files),
+        "figures_left_out": dict(figures_left_out),
+    }
+    ready: dict[str, Any] = json_ready(report)
+    return ready
+
+
+def no_object_reason(result: Result) -> str:
+    """Say why there is no object."""
+    if result.target is None:
+        return "no object: nothing casts a shadow of its own from all sides"
+    if not result.views_used:
+        return "no object: no view of the target was usable"
+    return "no object: no voxel of the carved volume lies in shadow from all sides"
+
+
+def _kind(reason: str) -> str:
+    """Return a reason without its numbers, to count the same ones together."""
+    words = ("#" if any(c.isdigit() for c in word) else word for word in reason.split())
+    return " ".join(words)
+
+
+def report_text(report: Mapping[str, Any]) -> str:
+    """Write a report as JSON text."""
+    return json.dumps(report, indent=2, allow_nan=False) + "\n"
+
+
+def summary(report: Mapping[str, Any]) -> str:
+    """Write the short table that is printed and kept as ``summary.txt``."""
+    truth = report["truth"] or {}
+    true = truth.get("dimensions") or {}
+    mine = report["dimensions"] or {}
+    lines = [f"csas-shadow {report['versions']['csas_shadow_ros']}: {report['verdict']}", ""]
+    if truth and not mine and not truth["object"]:
+        lines[0] += " (as is true)"
+    elif truth and bool(mine) != truth["object"]:
+        lines[0] += " (in truth there is one)" if truth["object"] else " (in truth there is none)"
+    if mine or true:
+        lines.append(f"{'':<14}{'found':>12}" + (f"{'truth':>12}{'difference':>12}" if true else ""))
+        rows = (
+            ("length", "length_m", "m"),
+            ("width", "width_m", "m"),
+            ("height", "height_m", "m"),
+            ("volume", "volume_m3", "m³"),
+            ("heading", "heading_deg", "°"),
+            ("position x", 0, "m"),
+            ("position y", 1, "m"),
+        )
+        for label, key, unit in rows:
+            values = [d["position_m"][key] if isinstance(key, int) else d[key] for d in (mine, true) if d]
+            digits = 1 if unit == "°" else 4 if unit == "m³" else 3
+            cells = [f"{value:.{digits}f} {unit}" for value in values]
+            if not mine:
+                cells.insert(0, "-")
+            line = f"{label:<14}" + "".join(f"{cell:>12}" for cell in cells)
+            if mine and true:
+                off = values[0] - values[1]
+                if unit == "°":
+                    off = (off + 90.0) % 180.0 - 90.0
+                line += f"{off:>+{12 - len(unit) - 1}.{digits}f} {unit}"
+            lines.append(line)
+        lines.append("")
+    if truth.get("scores"):
+        s = truth["scores"]
+        lines.append(
+            f"IoU against the truth {s['iou_truth']:.3f}, against its shadow hull {s['iou_hull']:.3f}"
+            f" (the hull itself: {s['iou_hull_truth']:.3f})"
+        )
+    grid, views = report["grid"], report["views"]
+    if grid:
+        threshold = "none" if grid["threshold"] is None else f"{grid['threshold']:.4f}"
+        lines.append(f"{grid['method']} carving, voxels of {grid['voxel_size_m']:g} m, threshold {threshold}")
+    lines.append(f"views: {views['in']} in, {views['used']} in the grid, {views['rejected']} not used")
+    lines += [f"  {n} not used: {reason}" for reason, n in views["reasons"].items()]
+    sign = report["spectrum_sign"]
+    lines.append(
+        f"spectrum sign: {sign['why'] if sign['verdict'] != 'not checked' else 'not checked, ' + sign['why']}"
+    )
+    if sign["override"] is not None:
+        lines.append(f"spectrum sign was overridden to {sign['override']:+d} on the command line")
+    lines += [f"problem with the input: {problem}" for problem in report["problems"]]
+    total = sum(v for v in report["timings_s"].values() if v is not None)
+    lines.append(f"time: {total:.1f} s")
+    return "\n".join(lines) + "\n"
