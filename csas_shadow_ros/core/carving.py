@@ -31,7 +31,17 @@ MASK_OUTSIDE, MASK_UNKNOWN, MASK_SHADOW = 0, 128, 255
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
-def _carve_slices(image, affines, x0, y0, step, first, last, total, count):  # pragma: no cover
+def _carve_slices(
+    image: NDArray[np.float32],
+    affines: NDArray[np.float64],
+    x0: float,
+    y0: float,
+    step: float,
+    first: int,
+    last: int,
+    total: NDArray[np.int32],
+    count: NDArray[np.uint16],
+) -> None:  # pragma: no cover
     """Add the image at every voxel's shadow pixel (bilinear) to the slices [first, last)."""
     rows, cols = image.shape
     ny, nx = total.shape[1:]

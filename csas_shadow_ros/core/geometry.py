@@ -156,7 +156,8 @@ class GroundGrid:
         d = 1.0 / p[0, 0]
         if abs(-1.0 / p[1, 1] - d) > 1e-6 * d:
             raise GeometryError(
-                f"pixels of the ground-plane image are {d:g} m by {-1.0 / p[1, 1]:g} m; expected square pixels"
+                f"pixels of the ground-plane image are {d:g} m by {-1.0 / p[1, 1]:g} m;"
+                " expected square pixels"
             )
         off = np.abs(p[[0, 0, 1, 1, 2, 2, 2], [1, 2, 0, 2, 0, 1, 2]])
         if np.any(off > 1e-6 / d):
@@ -204,11 +205,11 @@ class GroundGrid:
 
     def x_of_columns(self) -> FloatArray:
         """Scene x of each column's centre, shape (cols,)."""
-        return self.x_min_m + np.arange(self.cols) * self.spacing_m
+        return self.x_min_m + np.arange(self.cols, dtype=np.float64) * self.spacing_m
 
     def y_of_rows(self) -> FloatArray:
         """Scene y of each row's centre, shape (rows,), descending."""
-        return self.y_max_m - np.arange(self.rows) * self.spacing_m
+        return self.y_max_m - np.arange(self.rows, dtype=np.float64) * self.spacing_m
 
     def contains(self, x_m: float, y_m: float) -> bool:
         """Say whether the ground point lies on the image."""
@@ -305,12 +306,12 @@ class ShadowCamera:
 
     @cached_property
     def _sonar(self) -> FloatArray:
-        return -np.linalg.solve(self.projection[:, :3], self.projection[:, 3])
+        return np.asarray(-np.linalg.solve(self.projection[:, :3], self.projection[:, 3]), dtype=np.float64)
 
     @cached_property
     def _ground_to_pixel(self) -> FloatArray:
         a = self.projection[:, :3] @ np.linalg.inv(shadow_matrix(self._sonar)[:, :3])
-        return a / a[2, 2]
+        return np.asarray(a / a[2, 2], dtype=np.float64)
 
     @property
     def sonar_m(self) -> FloatArray:
@@ -325,7 +326,7 @@ class ShadowCamera:
     @cached_property
     def pixel_to_ground(self) -> FloatArray:
         """Inverse of `ground_to_pixel`."""
-        return np.linalg.inv(self._ground_to_pixel)
+        return np.asarray(np.linalg.inv(self._ground_to_pixel), dtype=np.float64)
 
     @cached_property
     def aspect_rad(self) -> float:
@@ -390,7 +391,8 @@ class ShadowCamera:
             raise GeometryError(f"height {z_m:g} m is not below the sonar at {self._sonar[2]:g} m")
         p = self.projection
         w = p[2, 2] * z_m + p[2, 3]  # rows 2 of P has no x, y terms: A is affine (checked at construction)
-        return np.column_stack([p[:2, 0], p[:2, 1], p[:2, 2] * z_m + p[:2, 3]]) / w
+        affine: FloatArray = np.column_stack([p[:2, 0], p[:2, 1], p[:2, 2] * z_m + p[:2, 3]]) / w
+        return affine
 
 
 @dataclass(frozen=True)
@@ -438,7 +440,8 @@ class ViewInfo:
         e_r = down_range_axis(self.aspect_rad)
         to_ground = self.camera.pixel_to_ground
         start = to_ground[:2] @ np.array([(self.camera.cols - 1) / 2.0, 0.0, 1.0])
-        return float(e_r @ start) + np.arange(self.camera.rows) * float(e_r @ to_ground[:2, 1])
+        rows = np.arange(self.camera.rows, dtype=np.float64)
+        return float(e_r @ start) + rows * float(e_r @ to_ground[:2, 1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -703,7 +706,7 @@ def aspects_of_step(step_rad: float, start_rad: float = 0.0) -> FloatArray:
         raise ParameterError(
             f"aspect step is {math.degrees(step_rad):g}°; expected a divisor of 360° (such as 1, 2, 5)"
         )
-    return start_rad + np.arange(n) * (TWO_PI / n)
+    return start_rad + np.arange(n, dtype=np.float64) * (TWO_PI / n)
 
 
 def fit_target_to_focus(infos: Sequence[ViewInfo]) -> tuple[float, float]:

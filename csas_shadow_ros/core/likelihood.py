@@ -150,7 +150,7 @@ def seabed_level(amplitude: FloatImage, background: str) -> FloatImage:
     if background == "global" or medians.size < 24:
         return np.full((rows, cols), math.exp(middle) / _MEDIAN_OVER_MODE, np.float32)
     design = _surface(v, u)
-    coefficients = np.zeros(6)
+    coefficients: NDArray[np.float64] = np.zeros(6)
     coefficients[0] = middle
     for _ in range(8):
         residual = log_level - design @ coefficients
@@ -159,14 +159,15 @@ def seabed_level(amplitude: FloatImage, background: str) -> FloatImage:
         # A little damping of slope and curvature: where outliers cover much of the view, stay flat.
         normal = (design * weight[:, None]).T @ design + np.diag([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])
         right = (design * weight[:, None]).T @ log_level
-        coefficients = np.linalg.solve(normal, right)
+        coefficients = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
     # The surface is smooth: a coarse lattice of it is interpolated.
     yy, xx = np.linspace(-1, 1, 33), np.linspace(-1, 1, 33)
     coarse = _surface(*np.meshgrid(yy, xx, indexing="ij")) @ coefficients
     u = (np.arange(cols, dtype=np.float32) + 0.5) / cols * 32
     v = (np.arange(rows, dtype=np.float32) + 0.5) / rows * 32
     level = np.exp(coarse).astype(np.float32) / np.float32(_MEDIAN_OVER_MODE)
-    return cv2.remap(level, *np.broadcast_arrays(u[None, :], v[:, None]), cv2.INTER_LINEAR)
+    map_u, map_v = np.broadcast_arrays(u[None, :], v[:, None])
+    return np.asarray(cv2.remap(level, map_u, map_v, cv2.INTER_LINEAR), dtype=np.float32)
 
 
 def box_mean(power: FloatImage, known: NDArray[np.bool_], radius_px: tuple[int, int]) -> FloatImage:
@@ -240,7 +241,7 @@ def view_levels(view: View, parameters: LikelihoodParameters | None = None) -> L
         If the view is not a real amplitude image, or holds too little to estimate levels.
     """
     p = parameters or LikelihoodParameters()
-    amplitude = view.pixels
+    amplitude: FloatImage = view.pixels
     if amplitude.dtype != np.float32:
         raise ViewError(f"shadow view has {amplitude.dtype} pixels; expected float32 amplitude")
     seabed = seabed_level(amplitude, p.background)

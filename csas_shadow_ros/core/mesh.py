@@ -62,7 +62,9 @@ def mesh_from_grid(grid: VoxelGrid) -> trimesh.Trimesh:
     if not grid.occupied.any():
         raise NoTargetError("the grid holds no object; expected at least one occupied voxel to mesh")
     d = grid.volume.voxel_size_m
-    vertices, faces, _, _ = marching_cubes(surface_field(grid), 0.0, spacing=(d, d, d))
+    vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
+        surface_field(grid), 0.0, spacing=(d, d, d)
+    )
     xyz = vertices[:, ::-1] - d + np.asarray(grid.volume.origin_m)  # (z, y, x) → (x, y, z); -d: the padding
     mesh = trimesh.Trimesh(xyz, faces[:, ::-1], process=True)
     if mesh.volume < 0:

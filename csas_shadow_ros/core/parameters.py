@@ -173,7 +173,8 @@ class CarvingParameters(Parameters):
     voxel_size_m: float = bounded(0.02, "edge of a voxel", low=1e-4, high=1e3, unit="m")
     threshold: float = bounded(
         0.0,
-        "object where the mean l_out (silhouettes: the contradicting fraction of the views) is below this; 0: automatic",
+        "object where the mean l_out (silhouettes: the contradicting fraction of the views) is below this;"
+        " 0: automatic",
         low=0.0,
         high=1.0,
     )

@@ -17,7 +17,8 @@ def wavenumbers(image: CoherentImage) -> tuple[NDArray[np.float64], NDArray[np.f
     """Return (Kx, Ky) of every bin of the image's 2-D FFT, each of the image's shape."""
     kx = 2 * np.pi * np.fft.fftfreq(image.grid.cols, image.grid.spacing_m)
     ky = -2 * np.pi * np.fft.fftfreq(image.grid.rows, image.grid.spacing_m)  # rows grow along -y
-    return tuple(np.meshgrid(kx, ky))  # type: ignore[return-value]
+    kx_grid, ky_grid = np.meshgrid(kx, ky)
+    return kx_grid, ky_grid
 
 
 def sub_aperture(image: CoherentImage, aspect_rad: float, aperture_rad: float) -> NDArray[np.complex128]:
@@ -69,7 +70,10 @@ def rotate_to_view(
     )
     u, v = np.meshgrid(np.arange(camera.cols), np.arange(camera.rows))
     ground = np.tensordot(camera.pixel_to_ground[:2], np.stack([u, v, np.ones_like(u)]), axes=1)
-    return rotated * np.exp(1j * (carrier[0] * ground[0] + carrier[1] * ground[1]))
+    modulated: NDArray[np.complex128] = rotated * np.exp(
+        1j * (carrier[0] * ground[0] + carrier[1] * ground[1])
+    )
+    return modulated
 
 
 def enhance(
@@ -99,10 +103,7 @@ def enhance(
     for row in range(camera.rows):
         delta = first + row * rows_m - focus_range_m
         if delta > 0:
-            if small_angle:
-                phase = k0 - k_c**2 / (2 * k0)
-            else:
-                phase = np.sqrt(np.maximum(k0**2 - k_c**2, 0.0))
+            phase = k0 - k_c**2 / (2 * k0) if small_angle else np.sqrt(np.maximum(k0**2 - k_c**2, 0.0))
             h = np.exp(1j * image.acoustics.spectrum_sign * delta * phase)
             out[row] = np.fft.ifft(np.fft.fft(view[row]) * h)
     return out

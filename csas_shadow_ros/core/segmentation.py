@@ -117,7 +117,7 @@ def _of_target(
     return np.asarray(keep[labels], dtype=np.bool_)
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True)
 def _mark_before(
     shadow: NDArray[np.bool_], edge: NDArray[np.bool_], flank: int, out: NDArray[np.bool_]
 ) -> None:  # pragma: no cover

@@ -43,15 +43,14 @@ def focus_phase_rate(
     """
     _, k0, _ = info.acoustics.ground_band(info.camera.grazing_rad)
     k_c = np.clip(cross_wavenumber_rad_m, -k0, k0)  # beyond K₀ nothing propagates
-    if form == "small_angle":
-        rate = -(k_c**2) / (2.0 * k0)
-    else:
-        rate = np.sqrt(k0**2 - k_c**2) - k0
+    rate = -(k_c**2) / (2.0 * k0) if form == "small_angle" else np.sqrt(k0**2 - k_c**2) - k0
     return info.acoustics.spectrum_sign * rate
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _apply_phase(rows, offsets, rate):  # pragma: no cover
+def _apply_phase(
+    rows: NDArray[np.complex64], offsets: NDArray[np.float32], rate: NDArray[np.float32]
+) -> None:  # pragma: no cover
     for i in range(rows.shape[0]):
         delta = offsets[i]
         for k in range(rows.shape[1]):
@@ -60,7 +59,7 @@ def _apply_phase(rows, offsets, rate):  # pragma: no cover
 
 
 @numba.njit(cache=True, nogil=True)
-def _shrink_rows(known, margins):  # pragma: no cover
+def _shrink_rows(known: NDArray[np.bool_], margins: NDArray[np.int64]) -> None:  # pragma: no cover
     """Drop `margins[i]` pixels from both ends of each row's known interval (and all beyond)."""
     cols = known.shape[1]
     for i in range(known.shape[0]):

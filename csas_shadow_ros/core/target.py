@@ -219,8 +219,8 @@ def choose_target(search: Search | None, parameters: TargetParameters) -> Target
         here = [t for t in found if _covers(t, p.position_m)]
         if not here:
             raise NoTargetError(
-                f"no object at the given position ({p.position_m[0]:g}, {p.position_m[1]:g}) m; expected one, or"
-                " size_m given too"
+                f"no object at the given position ({p.position_m[0]:g}, {p.position_m[1]:g}) m;"
+                " expected one, or size_m given too"
             )
         target = replace(here[0], position_m=(p.position_m[0], p.position_m[1]))
     elif found:
@@ -265,7 +265,8 @@ class SignEvidence:
     def __str__(self) -> str:
         text = {
             "right": "shadows fall away from the sonar, as they must",
-            "wrong": f"shadows fall towards the sonar and enhancement would blur them: expected {-self.stated:+d}",
+            "wrong": "shadows fall towards the sonar and enhancement would blur them:"
+            f" expected {-self.stated:+d}",
             "unknown": "no shadows to tell by",
         }[self.verdict]
         return f"spectrum_sign is {self.stated:+d}: {text}"

@@ -58,17 +58,17 @@ class Volume:
     @property
     def x_m(self) -> NDArray[np.float64]:
         """Centres along x, shape (nx,)."""
-        return self.origin_m[0] + np.arange(self.shape[2]) * self.voxel_size_m
+        return self.origin_m[0] + np.arange(self.shape[2], dtype=np.float64) * self.voxel_size_m
 
     @property
     def y_m(self) -> NDArray[np.float64]:
         """Centres along y, shape (ny,)."""
-        return self.origin_m[1] + np.arange(self.shape[1]) * self.voxel_size_m
+        return self.origin_m[1] + np.arange(self.shape[1], dtype=np.float64) * self.voxel_size_m
 
     @property
     def z_m(self) -> NDArray[np.float64]:
         """Centres along z, shape (nz,)."""
-        return self.origin_m[2] + np.arange(self.shape[0]) * self.voxel_size_m
+        return self.origin_m[2] + np.arange(self.shape[0], dtype=np.float64) * self.voxel_size_m
 
     @property
     def centre_m(self) -> tuple[float, float, float]:

@@ -54,7 +54,7 @@ class Scene:
 
 def _turn(angle_rad: float, axis: Sequence[float] = (0.0, 0.0, 1.0)) -> FloatArray:
     """Return the 4×4 rotation about an axis."""
-    return np.asarray(trimesh.transformations.rotation_matrix(angle_rad, axis))  # type: ignore[no-untyped-call]
+    return np.asarray(trimesh.transformations.rotation_matrix(angle_rad, axis))
 
 
 def join_bodies(bodies: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
@@ -236,7 +236,7 @@ def _rest_on_seabed(mesh: Any, name: str) -> trimesh.Trimesh:
         closed.merge_vertices()  # formats such as STL repeat the corners for each triangle
     if not closed.is_watertight:
         raise GeometryError(f"mesh {name} is not closed; expected a watertight surface")
-    trimesh.repair.fix_normals(closed, multibody=True)  # type: ignore[no-untyped-call]
+    trimesh.repair.fix_normals(closed, multibody=True)
     low, high = closed.bounds
     closed.apply_translation([-(low[0] + high[0]) / 2.0, -(low[1] + high[1]) / 2.0, -low[2]])
     return closed
