@@ -98,8 +98,9 @@ def band_of_image(image: CoherentImage, grazing_rad: float) -> tuple[float, floa
     nyquist = math.pi / image.grid.spacing_m
     if high > nyquist * (1 + 1e-9):
         raise ParameterError(
-            f"the band reaches {high:.0f} rad/m on the ground, but a pixel of {image.grid.spacing_m * 1e3:.3g} mm"
-            f" holds only {nyquist:.0f} rad/m: expected a pixel of at most {math.pi / high * 1e3:.3g} mm"
+            f"the band reaches {high:.0f} rad/m on the ground, but a pixel of"
+            f" {image.grid.spacing_m * 1e3:.3g} mm holds only {nyquist:.0f} rad/m: expected a pixel of"
+            f" at most {math.pi / high * 1e3:.3g} mm"
         )
     margin = _BAND_MARGIN * (high - low)
     return max(low - margin, 1e-6), min(high + margin, nyquist)
@@ -140,7 +141,7 @@ def _kernel_table() -> NDArray[np.float32]:
     offset = np.arange(_TABLE + 1)[:, None] / _TABLE
     distance = np.arange(_TAPS)[None, :] - (_TAPS // 2 - 1) - offset
     inside = np.clip(1.0 - (2.0 * distance / _TAPS) ** 2, 0.0, None)
-    return np.i0(_kaiser_beta() * np.sqrt(inside)).astype(np.float32)
+    return np.asarray(np.i0(_kaiser_beta() * np.sqrt(inside)), dtype=np.float32)
 
 
 @lru_cache(maxsize=64)
@@ -149,13 +150,25 @@ def _kernel_inverse(half: int, size: int) -> NDArray[np.float32]:
     u = (math.pi * _TAPS * np.arange(-half, half + 1) / size) ** 2
     root = np.sqrt(_kaiser_beta() ** 2 - u + 0j)
     transform = (_TAPS * np.sinh(root) / root).real
-    return (1.0 / transform).astype(np.float32)
+    return np.asarray(1.0 / transform, dtype=np.float32)
 
 
 @numba.njit(cache=True, nogil=True)
 def _cut_wedge(
-    spectrum, centre, half, steps, edge_low, edge_high, band, taper, width, weights_v, weights_u, factor, out
-):  # pragma: no cover
+    spectrum: NDArray[np.complex64],
+    centre: tuple[int, int],
+    half: tuple[int, int],
+    steps: tuple[float, float],
+    edge_low: float,
+    edge_high: float,
+    band: tuple[float, float],
+    taper: NDArray[np.float32],
+    width: float,
+    weights_v: NDArray[np.float32],
+    weights_u: NDArray[np.float32],
+    factor: np.complex64,
+    out: NDArray[np.complex64],
+) -> None:  # pragma: no cover
     """Copy a wedge of the spectrum, weighted, into `out` so that the carrier lands on bin 0."""
     rows, cols = spectrum.shape
     out_rows, out_cols = out.shape
@@ -190,7 +203,13 @@ def _cut_wedge(
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _resample(box, table, affine, limits, out):  # pragma: no cover
+def _resample(
+    box: NDArray[np.float32],
+    table: NDArray[np.float32],
+    affine: NDArray[np.float64],
+    limits: NDArray[np.float64],
+    out: NDArray[np.float32],
+) -> None:  # pragma: no cover
     """Interpolate an image at an affine lattice; NaN outside `limits`.
 
     `box` is (rows, cols, 2) float32, extended by `_BORDER` samples of its period on every side;
