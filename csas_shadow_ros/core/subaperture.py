@@ -301,6 +301,11 @@ class SubApertures:
         half = self.aperture_rad / 2.0
         down_range = (low * math.cos(half), high)
         bandwidth = max(down_range[1] - down_range[0], 2.0 * high * math.sin(half))
+        if p.spacing_m > 2.0 * math.pi / bandwidth:
+            raise ParameterError(
+                f"spacing_m is {p.spacing_m:g} m; expected at most {2.0 * math.pi / bandwidth:.3g} m, which"
+                f" the bandwidth of a {p.aperture_deg:g}° aperture needs, or 0 for automatic"
+            )
         #: Pixel of the views (m).
         self.spacing_m = p.spacing_m or 2.0 * math.pi / (p.oversampling * bandwidth)
         self._carrier = sum(down_range) / 2.0
