@@ -1,0 +1,239 @@
+#!/usr/bin/env python3
+"""Measure the figures that ``docs/method.md`` states, on simulated runs.
+
+    python docs/measure.py fast            # the fast path against the literal steps of the paper
+    python docs/measure.py search [TARGET]  # target search and spectrum sign
+    python docs/measure.py carve [TARGET]  # what enhancement, echo, support and threshold each do
+
+Every run is of the `standard` profile, seed 1. `carve` uses 180 views (2° steps); IoU is against the shadow
+hull, the voxels that perfect silhouettes would leave.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from csas_shadow_ros.core import reference
+from csas_shadow_ros.core.carving import MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, Carver
+from csas_shadow_ros.core.geometry import ShadowCamera, View
+from csas_shadow_ros.core.likelihood import echo_mask
+from csas_shadow_ros.core.parameters import (
+    CarvingParameters,
+    PipelineParameters,
+    ShadowParameters,
+    SubApertureParameters,
+    TargetParameters,
+)
+from csas_shadow_ros.core.pipeline import ProcessedView, run
+from csas_shadow_ros.core.shadow import enhance, focus_range
+from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
+from csas_shadow_ros.core.target import SignEvidence, Target, spectrum_sign_evidence
+from csas_shadow_ros.core.threshold import occupied_voxels, supported
+from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.simulation import simulate
+from csas_shadow_ros.simulation.hull import iou, shadow_hull
+
+TARGETS = ("box", "cone", "tyre", "sphere", "cylinder", "frame")
+SEED = 1
+FINE = 4  # pixels of the literal path, and of the image, in one of the fast path's
+
+
+def fast() -> None:
+    """Time one view both ways, and compare them."""
+    made = simulate("standard", "box", seed=SEED)
+    image, track, target = made.image, made.track, (0.0, 0.0)
+    start = time.perf_counter()
+    spectrum = Spectrum.of_image(image, workers=1)
+    print(f"spectrum of {image.grid.shape}, once a run: {(time.perf_counter() - start) * 1e3:.0f} ms")
+
+    default = SubApertures(image, track, spectrum=spectrum)
+    enhance(default.view_of_aspect(0.0), target)  # compiles
+    aspects = np.radians(np.arange(5.0, 360.0, 15.0))
+    start = time.perf_counter()
+    views = [default.view_of_aspect(a) for a in aspects]
+    middle = time.perf_counter()
+    shadows = [enhance(v, target) for v in views]
+    end = time.perf_counter()
+    each = (middle - start) / len(aspects), (end - middle) / len(aspects)
+    print(f"views of {default.size}² pixels of {default.spacing_m * 1e3:.2f} mm, one thread:")
+    print(f"  sub-aperture {each[0] * 1e3:.1f} ms, enhancement {each[1] * 1e3:.1f} ms")
+    before, after = (float(np.mean([np.isfinite(v.pixels).mean() for v in vs])) for vs in (views, shadows))
+    print(f"  known pixels: {before:.1%} of a view before enhancement, {after:.1%} after (valid margins)")
+
+    parameters = SubApertureParameters(spacing_m=FINE * image.grid.spacing_m)
+    sub_apertures = SubApertures(image, track, parameters, spectrum=spectrum)
+    view = sub_apertures.view_of_aspect(math.radians(33.0))
+    shadow = enhance(view, target)
+    info = view.info
+    finer = info.camera.ground_to_pixel.copy()
+    finer[:2] *= FINE
+    camera = ShadowCamera.from_ground(finer, info.camera.sonar_m, *(FINE * n for n in info.camera.shape))
+    start = time.perf_counter()
+    literal = reference.sub_aperture(image, info.aspect_rad, info.aperture_rad)
+    literal = reference.rotate_to_view(literal, image, camera, info.aspect_rad)
+    focused = reference.enhance(literal, image, camera, info.aspect_rad, focus_range(info, target))
+    seconds = time.perf_counter() - start
+    print(f"literal steps at full size: {seconds:.2f} s, {seconds / sum(each):.0f} times the fast path")
+    inside = scipy.ndimage.binary_erosion(np.isfinite(shadow.pixels), iterations=20)
+    for name, ours, theirs in (("sub-aperture", view, literal), ("enhanced", shadow, focused)):
+        a, b = np.abs(ours.pixels), np.abs(theirs[::FINE, ::FINE])
+        error = math.sqrt(np.mean((a - b)[inside] ** 2) / np.mean(b[inside] ** 2))
+        print(f"  {name}: amplitudes differ by {error:.1e} of their rms, 20 pixels off the borders")
+    print(f"  kernel interpolation: {_kernel_error(sub_apertures, view):.1e} of the rms, against exact sums")
+
+
+def _kernel_error(sub_apertures: SubApertures, view: View) -> float:
+    """Compare 400 pixels of a baseband view with the exact sum over the wedge's wavenumbers."""
+    spectrum, grid = sub_apertures.spectrum, sub_apertures.grid
+    rows, cols = spectrum.values.shape
+    ky = -2 * math.pi * np.fft.fftfreq(rows, grid.spacing_m)[:, None]
+    kx = 2 * math.pi * np.fft.fftfreq(cols, grid.spacing_m)[None, :]
+    k, angle = np.hypot(kx, ky), np.arctan2(ky, kx)
+    low, high = sub_apertures.wedge_edges(view.info.aspect_rad)
+    wedge = (k >= sub_apertures.band[0]) & (k <= sub_apertures.band[1]) & (angle >= low) & (angle < high)
+    values = spectrum.values[wedge].astype(np.complex128)
+    k_x, k_y = np.broadcast_to(kx, k.shape)[wedge], np.broadcast_to(ky, k.shape)[wedge]
+    v, u = np.nonzero(np.isfinite(view.pixels))
+    some = np.random.default_rng(SEED).choice(len(u), 400, replace=False)
+    ground = view.info.camera.pixel_to_ground[:2] @ np.stack([u[some], v[some], np.ones(400)])
+    x, y = ground
+    phase = np.outer(x - grid.x_min_m, k_x) + np.outer(y - grid.y_max_m, k_y)
+    carrier = view.info.carrier_rad_m
+    exact = (np.exp(1j * phase) @ values) * np.exp(-1j * (carrier[0] * x + carrier[1] * y))
+    error = view.pixels[v[some], u[some]] - exact
+    return float(np.sqrt(np.mean(np.abs(error) ** 2) / np.mean(np.abs(exact) ** 2)))
+
+
+def search(names: tuple[str, ...]) -> None:
+    """Print what the search finds, and the evidence for either spectrum sign."""
+    for name in names:
+        made = simulate("standard", name, seed=SEED)
+        start = time.perf_counter()
+        evidence, found = spectrum_sign_evidence(made.image, made.track)
+        print(f"{name}: {time.perf_counter() - start:.1f} s")
+        _print_search(evidence, found.best if found else None, made.truth.dims_m)
+
+
+def _print_search(evidence: SignEvidence, best: Target | None, true_m: tuple[float, ...]) -> None:
+    stated, other = evidence.stated_evidence, evidence.other_evidence
+    print(f"  sign: evidence {stated:.1e} m⁴ as stated, {other:.1e} m⁴ the other way: {evidence.verdict}")
+    if best is None:
+        print("  no object")
+        return
+    size, true = (" × ".join(f"{s:.2f}" for s in sizes) for sizes in (best.size_m, true_m))
+    print(f"  target {math.hypot(*best.position_m):.2f} m off its place, volume {size} m for {true} m")
+
+
+class _Variants:
+    """Carvers of one volume, each fed another reading of the same views."""
+
+    def __init__(self) -> None:
+        self.views: list[tuple[View, View, NDArray[np.bool_], NDArray[np.bool_]]] = []
+
+    def __call__(self, view: ProcessedView) -> None:
+        levels = view.levels
+        echo = echo_mask(levels.power, levels.known, 8.0)
+        self.views.append((view.mask, view.likelihood, echo, levels.known))
+
+    def masks(self, unknown: str) -> list[View]:
+        """Return the masks with all of the unknown zone, the bright echo alone, or nothing but off-image."""
+        out = []
+        for mask, _, echo, known in self.views:
+            pixels = mask.pixels.copy()
+            if unknown != "zone":
+                keep = echo | ~known if unknown == "echo" else ~known
+                pixels[(pixels == MASK_UNKNOWN) & ~keep] = MASK_OUTSIDE
+            out.append(replace(mask, pixels=pixels))
+        return out
+
+
+def _carve(views: list[View], volume: Volume, method: str) -> Carver:
+    carver = Carver(volume, CarvingParameters(method=method))
+    for view in views:
+        if view.pixels.dtype != np.uint8 or (view.pixels == MASK_SHADOW).any():
+            carver.integrate(view)
+    return carver
+
+
+def carve(names: tuple[str, ...]) -> None:
+    """Print IoU with the shadow hull for the default and with one thing changed at a time."""
+    table: dict[str, list[str]] = {}
+    for name in names:
+        made = simulate("standard", name, seed=SEED)
+        keep = _Variants()
+        parameters = PipelineParameters(sub_aperture=SubApertureParameters(step_deg=2.0))
+        result = run(made.image, made.track, parameters, on_view=keep)
+        if result.grid is None or result.target is None or result.sign is None:
+            raise SystemExit(f"nothing was found of {name}")
+        print(f"{name}: {result.views_used} views")
+        _print_search(result.sign, result.target, made.truth.dims_m)
+        volume = result.grid.volume
+        hull = shadow_hull(made.truth.target, [v[0].info.camera.sonar_m for v in keep.views], volume)
+        grid = result.grid
+        rows: dict[str, float] = {"default (consensus)": iou(grid.occupied, hull)}
+        for label, unknown in (("  echo alone unknown", "echo"), ("  echo read as outside", "none")):
+            rows[label] = iou(_carve(keep.masks(unknown), volume, "consensus").grid().occupied, hull)
+        with np.errstate(invalid="ignore"):
+            dark = grid.likelihood < grid.threshold
+        rows["  no support"] = iou(_largest(dark), hull)
+        rows["  supported whatever is seen"] = iou(_largest(supported(dark, grid.likelihood, 2.0)), hull)
+        rows["  best threshold"] = max(
+            iou(occupied_voxels(grid.likelihood, t, "consensus"), hull) for t in np.arange(0.005, 0.15, 0.005)
+        )
+        rows["hard"] = iou(_carve(keep.masks("zone"), volume, "hard").grid().occupied, hull)
+        soft = _carve([v[1] for v in keep.views], volume, "soft")
+        rows["soft"] = iou(soft.grid().occupied, hull)
+        mean = soft.likelihood()
+        rows["  best threshold (soft)"] = max(
+            iou(occupied_voxels(mean, t, "soft"), hull) for t in np.arange(0.02, 0.4, 0.02)
+        )
+        plain = PipelineParameters(
+            sub_aperture=SubApertureParameters(step_deg=2.0, check_sign=False),
+            shadow=ShadowParameters(enhancement="none"),
+            target=TargetParameters("given", result.target.position_m, result.target.size_m),
+        )
+        bare = run(made.image, made.track, plain)
+        if bare.grid is None:
+            raise SystemExit(f"nothing was found of {name} without enhancement")
+        rows["no enhancement (consensus)"] = iou(bare.grid.occupied, hull)
+        for label, value in rows.items():
+            table.setdefault(label, []).append(f"{value:10.2f}")
+    print(f"{'IoU with the shadow hull':28}" + "".join(f"{n:>10}" for n in names))
+    for label, values in table.items():
+        print(f"{label:28}" + "".join(values))
+
+
+def _largest(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    labels, count = scipy.ndimage.label(dark, np.ones((3, 3, 3), bool))
+    if not count:
+        return dark
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return np.asarray((sizes >= 0.05 * sizes.max())[labels] & dark)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one of the measurements."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("what", choices=("fast", "search", "carve"))
+    parser.add_argument("target", nargs="*", help="for search and carve (default: all)")
+    options = parser.parse_args(argv)
+    if options.what == "fast":
+        fast()
+    elif options.what == "search":
+        search(tuple(options.target) or (*TARGETS, "empty"))
+    else:
+        carve(tuple(options.target) or TARGETS)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
