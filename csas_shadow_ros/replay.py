@@ -109,7 +109,7 @@ class ReplayResult:
     target : Target or None
         The volume that was carved; None: there is no object.
     grid : VoxelGrid or None
-        The carved grid. `views` holds numbers for the occupied voxels alone: the others' do not travel.
+        The carved grid.
     mesh, dimensions : trimesh.Trimesh, Dimensions or None
         Surface and measures of the object.
     composites : dict
@@ -692,7 +692,6 @@ def _collect(
     watcher: _Watcher, graph: Graph, stage: str, p: PipelineParameters, target: Target | None
 ) -> ReplayResult:
     from msg_adapters import ground_picture_from_msgs, mesh_from_msg, target_from_msg, voxel_grid_from_msgs
-    from msg_adapters import voxels_from_msg as read_voxels
 
     result = ReplayResult(stage, target=target)
     for (node, stream), beat in sorted(watcher.beats.items()):
@@ -708,7 +707,8 @@ def _collect(
     if stage in ("image", "sector"):
         topics.append("target")
     if result.views_used:
-        topics += ["voxel_grid/image", "voxel_grid/camera_info", "voxels", "mesh"]
+        topics += [f"{s}/{t}" for s in ("voxel_grid", "voxel_views") for t in ("image", "camera_info")]
+        topics += ["voxels", "mesh"]
     if result.nodes.get("composites") and result.nodes["composites"].counts.get("views"):
         topics += [f"{s}/{t}" for s in ("multilook", "color_by_aspect") for t in ("image", "camera_info")]
     got = watcher.collect(tuple(topics), 20.0)
@@ -721,9 +721,12 @@ def _collect(
         _, volume, likelihood = voxel_grid_from_msgs(got["voxel_grid/image"], got["voxel_grid/camera_info"])
         threshold = p.carving.threshold or object_threshold(likelihood, p.carving.method)
         occupied = occupied_voxels(likelihood, threshold, p.carving.method)
-        views = np.zeros(likelihood.shape, np.uint16)
-        views[occupied] = read_voxels(got["voxels"]).views
-        result.grid = VoxelGrid(volume, likelihood, views, threshold, occupied, p.carving.method)
+        _, _, views = voxel_grid_from_msgs(
+            got["voxel_views/image"], got["voxel_views/camera_info"], "voxel_views"
+        )
+        result.grid = VoxelGrid(
+            volume, likelihood, views.astype(np.uint16), threshold, occupied, p.carving.method
+        )
         result.mesh = mesh_from_msg(got["mesh"])
         result.dimensions = measure(result.mesh) if result.mesh is not None else None
     for name in ("multilook", "color_by_aspect"):

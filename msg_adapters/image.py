@@ -269,6 +269,9 @@ def check_pixels(pixels: NDArray[Any], kind: ImageStream) -> None:
         _refuse(~known & (pixels != 128), pixels, where, "none of 0, 128, 255", "0, 128 or 255")
         return
     finite = np.isfinite(pixels)
+    if content == "count":
+        _refuse(~finite | (pixels < 0), pixels, where, "not counts", "numbers of views, 0 or more")
+        return
     if content == "coherent":
         if not finite.all():
             _refuse(~finite, pixels, where, "not finite", "finite numbers")

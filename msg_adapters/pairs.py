@@ -134,7 +134,11 @@ def ground_picture_to_msgs(
 
 
 def voxel_grid_to_msgs(
-    factory: MessageFactory, volume: Volume, likelihood: NDArray[Any], stamp_ns: int
+    factory: MessageFactory,
+    volume: Volume,
+    likelihood: NDArray[Any],
+    stamp_ns: int,
+    stream_name: str = "voxel_grid",
 ) -> tuple[Any, Any]:
     """Make (Image, CameraInfo) of a dense grid.
 
@@ -148,6 +152,8 @@ def voxel_grid_to_msgs(
         Mean l_out; NaN where unknown. Goes out as rows y (north up), columns x, a channel a height.
     stamp_ns : int
         Stamp, ns.
+    stream_name : {'voxel_grid', 'voxel_views'}
+        What the numbers are: likelihoods, or counts of views.
 
     Raises
     ------
@@ -156,17 +162,19 @@ def voxel_grid_to_msgs(
     """
     if likelihood.shape != volume.shape:
         raise AdapterError(
-            f"voxel_grid/image has {likelihood.shape} voxels; expected {volume.shape} (z, y, x)"
+            f"{stream_name}/image has {likelihood.shape} voxels; expected {volume.shape} (z, y, x)"
         )
     pixels = np.ascontiguousarray(likelihood.transpose(1, 2, 0)[::-1], dtype=np.float32)
     return (
-        image_to_msg(factory, pixels, stamp_ns, "voxel_grid"),
+        image_to_msg(factory, pixels, stamp_ns, stream_name),
         voxel_info_to_msg(factory, volume, stamp_ns),
     )
 
 
-def voxel_grid_from_msgs(image: Any, info: Any) -> tuple[int, Volume, NDArray[np.float32]]:
-    """Read a dense grid.
+def voxel_grid_from_msgs(
+    image: Any, info: Any, stream_name: str = "voxel_grid"
+) -> tuple[int, Volume, NDArray[np.float32]]:
+    """Read a dense grid: likelihoods, or counts of views (`voxel_views`).
 
     Returns
     -------
@@ -179,8 +187,8 @@ def voxel_grid_from_msgs(image: Any, info: Any) -> tuple[int, Volume, NDArray[np
     AdapterError
         If either message breaks the contract or they do not belong together.
     """
-    check_pair(image, info, "voxel_grid/image")
-    pixels = image_from_msg(image, "voxel_grid")
+    check_pair(image, info, f"{stream_name}/image")
+    pixels = image_from_msg(image, stream_name)
     stamp_ns, volume = voxel_info_from_msg(info, pixels.shape[2])
     return stamp_ns, volume, np.ascontiguousarray(pixels[::-1].transpose(2, 0, 1))
 

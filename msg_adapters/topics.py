@@ -33,7 +33,7 @@ CSAS_SUB_APERTURE = "csas_sub_aperture"
 CSAS_SHADOW = "csas_shadow"
 CSAS_VOXEL_GRID = "csas_voxel_grid"
 
-Content = Literal["coherent", "sub_aperture", "amplitude", "likelihood", "mask", "picture"]
+Content = Literal["coherent", "sub_aperture", "amplitude", "likelihood", "mask", "picture", "count"]
 
 _ACOUSTICS = ("centre frequency (Hz)", "bandwidth (Hz)", "sound speed (m/s)", "spectrum_sign (+1 or -1)")
 _APERTURE = (
@@ -162,6 +162,13 @@ STREAMS: dict[str, ImageStream] = {
             "likelihood",
             "dense voxel grid: rows y (north up), columns x, one channel a height",
         ),
+        ImageStream(
+            "voxel_views",
+            (VOXEL_ENCODING,),
+            CSAS_VOXEL_GRID,
+            "count",
+            "how many views know something of each voxel, on the lattice of voxel_grid",
+        ),
     )
 }
 
@@ -221,3 +228,13 @@ def clean_namespace(namespace: str) -> str:
     """Return a namespace with one leading and no trailing slash; '' for the root."""
     stripped = namespace.strip("/")
     return f"/{stripped}" if stripped else ""
+
+
+def topic_table() -> str:
+    """Write the contract's topics as a markdown table, for the README."""
+    lines = ["| topic | type | encoding or kind | holds |", "|---|---|---|---|"]
+    for topic in TOPICS.values():
+        package, _, name = topic.type_name.split("/")
+        kind = ", ".join(topic.encodings or topic.distortion_models)
+        lines.append(f"| `{topic.name}` | {package}/{name} | {kind} | {topic.description} |")
+    return "\n".join(lines) + "\n"

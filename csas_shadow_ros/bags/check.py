@@ -284,8 +284,8 @@ def _read(stream_name: str, image: Any, info: Any) -> Any:
         return coherent_image_from_msgs(image, info)
     if stream_name == "sector":
         return sector_from_msgs(image, info)
-    if stream_name == "voxel_grid":
-        return voxel_grid_from_msgs(image, info)
+    if stream_name in ("voxel_grid", "voxel_views"):
+        return voxel_grid_from_msgs(image, info, stream_name)
     if stream_name in VIEW_STREAMS:
         return view_from_msgs(image, info, stream_name)
     return ground_picture_from_msgs(image, info, stream_name)

@@ -23,7 +23,7 @@ _FLOWING = (*VIEW_STREAMS, "sector")
 #: Latched when they were published, and so when they are played.
 _LATCHED = frozenset(
     {"image", "camera_info", "track", "target", "voxels", "mesh"}
-    | {t for s in ("multilook", "color_by_aspect", "voxel_grid") for t in (f"{s}/image", f"{s}/camera_info")}
+    | {t for s in ("multilook", "color_by_aspect", "voxel_grid", "voxel_views") for t in (f"{s}/image", f"{s}/camera_info")}
 )
 #: Topics of messages that differ though they carry the same stamp.
 _NEVER_ALIKE = frozenset({"progress", "/diagnostics"})

@@ -33,6 +33,8 @@ class VoxelCarverNode(CsasNode):
         self.forget()
         self.grid_image = self.publisher("voxel_grid/image", qos.LATCHED)
         self.grid_info = self.publisher("voxel_grid/camera_info", qos.LATCHED)
+        self.views_image = self.publisher("voxel_views/image", qos.LATCHED)
+        self.views_info = self.publisher("voxel_views/camera_info", qos.LATCHED)
         self.voxels = self.publisher("voxels", qos.LATCHED)
         self.mesh = self.publisher("mesh", qos.LATCHED)
         self.stream = "shadow_mask" if p.takes_masks else "likelihood"
@@ -92,6 +94,9 @@ class VoxelCarverNode(CsasNode):
         image, info = voxel_grid_to_msgs(self.messages, grid.volume, grid.likelihood, stamp)
         self.grid_info.publish(info)
         self.grid_image.publish(image)
+        image, info = voxel_grid_to_msgs(self.messages, grid.volume, grid.views, stamp, "voxel_views")
+        self.views_info.publish(info)
+        self.views_image.publish(image)
         self.voxels.publish(voxels_to_msg(self.messages, grid, stamp))
         mesh = mesh_from_grid(grid) if grid.occupied.any() else None
         self.mesh.publish(mesh_to_msg(self.messages, mesh, stamp))

@@ -25,7 +25,7 @@ from ..core.geometry import Acoustics, CoherentImage, Track, View
 from ..core.pipeline import Result
 
 _LATCHED = ("image", "camera_info", "track", "target", "mesh", "voxels")
-_LATCHED_STREAMS = ("multilook", "color_by_aspect", "voxel_grid")
+_LATCHED_STREAMS = ("multilook", "color_by_aspect", "voxel_grid", "voxel_views")
 
 
 class ResultBag:
@@ -43,7 +43,8 @@ class ResultBag:
         self._folder = folder
         self._factory = RosbagsMessages()
         self._work = folder / ".bag"
-        self._writer = BagWriter(self._work, file_name=self.FILE)
+        # Hundreds of noisy views: zstd would take longer than all of the method.
+        self._writer = BagWriter(self._work, compress="lz4", file_name=self.FILE)
         self._acoustics: Acoustics | None = None
         self._last_ns = 0
         names = [*_LATCHED, *(f"{s}/{kind}" for s in _LATCHED_STREAMS for kind in ("image", "camera_info"))]
@@ -120,6 +121,9 @@ class ResultBag:
             picture, camera = voxel_grid_to_msgs(factory, grid.volume, grid.likelihood, when)
             self._write("voxel_grid/camera_info", camera)
             self._write("voxel_grid/image", picture)
+            picture, camera = voxel_grid_to_msgs(factory, grid.volume, grid.views, when, "voxel_views")
+            self._write("voxel_views/camera_info", camera)
+            self._write("voxel_views/image", picture)
             self._write("voxels", voxels_to_msg(factory, grid, when))
         box = None if grid is None else TargetBox.of(grid.volume)
         self._write("target", target_to_msg(factory, box, when))

@@ -36,6 +36,8 @@ def sample(stream_name, encoding=None):
         return (rng.random(SHAPE) < 0.5).astype(np.uint8) * 255
     if stream_name == "color_by_aspect":
         return rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
+    if stream_name == "voxel_views":
+        return rng.integers(0, 361, (*SHAPE, 4)).astype(np.float32)
     if stream_name == "voxel_grid":
         return rng.random((*SHAPE, 4)).astype(np.float32)
     return rng.random(SHAPE).astype(np.float32)
@@ -214,6 +216,7 @@ BAD_PIXELS = [
     ("likelihood", -0.25, r"likelihood/image has 1 of 35 pixels outside \[0, 1\]"),
     ("likelihood", -np.inf, r"likelihood/image has 1 of 35 pixels infinite"),
     ("shadow_mask", 1, r"shadow_mask/image has 1 of 35 pixels none of 0, 128, 255.*\(1\)"),
+    ("voxel_views", -1.0, r"voxel_views/image has 4 of 140 pixels not counts.*row 2, column 3, channel 0"),
     ("voxel_grid", 2.0, r"voxel_grid/image has 4 of 140 pixels outside.*row 2, column 3, channel 0"),
 ]
 
