@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import yaml
 from mcap.exceptions import McapError
@@ -308,8 +308,8 @@ class BagWriter:
     ----------
     path : path-like
         Directory to make.
-    compress : bool
-        Chunks compressed with zstd.
+    compress : bool or str
+        Chunks compressed with zstd; ``"lz4"``: a tenth larger, four times as fast.
     overwrite : bool
         Replace a bag that is there. Anything but a bag is never removed.
     depth : int
@@ -327,7 +327,7 @@ class BagWriter:
         self,
         path: str | Path,
         *,
-        compress: bool = True,
+        compress: bool | Literal["lz4"] = True,
         overwrite: bool = False,
         depth: int = 100,
         file_name: str | None = None,
@@ -347,9 +347,8 @@ class BagWriter:
             self._stream = self.file.open("wb")
         except OSError as error:
             raise BagError(f"cannot make {self.path}: {error.strerror}") from error
-        self._writer: Any = Writer(
-            self._stream, compression=CompressionType.ZSTD if compress else CompressionType.NONE
-        )
+        kinds = {True: CompressionType.ZSTD, False: CompressionType.NONE, "lz4": CompressionType.LZ4}
+        self._writer: Any = Writer(self._stream, compression=kinds[compress])
         self._writer.start(profile="ros2", library="csas_shadow_ros")
 
     def _make_room(self, overwrite: bool) -> None:

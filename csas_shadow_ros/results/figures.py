@@ -278,7 +278,8 @@ def figure_1c(subject: Subject) -> Figure:
     wheel = figure.add_subplot(parts[1], projection="polar")
     angle = np.linspace(0.0, TWO_PI, 361)
     colours = np.stack([angle[:-1] / TWO_PI, np.ones(360), np.ones(360)], axis=-1)
-    wheel.bar(angle[:-1], 0.4, width=TWO_PI / 359, bottom=0.6, color=hsv_to_rgb(colours), align="edge")
+    rgb = hsv_to_rgb(colours)
+    wheel.bar(angle[:-1], 0.4, width=TWO_PI / 360, bottom=0.6, color=rgb, edgecolor=rgb, align="edge")
     wheel.set_ylim(0, 1)
     wheel.set_yticks([])
     wheel.grid(False)
@@ -520,10 +521,18 @@ def _surface(grid: VoxelGrid) -> trimesh.Trimesh | None:
         if len(faces) <= _MAX_FACES or step == 4:
             break
     xyz = vertices[:, ::-1] - d + np.asarray(grid.volume.origin_m)
-    return trimesh.Trimesh(xyz, faces[:, ::-1], process=False)
+    mesh = trimesh.Trimesh(xyz, faces[:, ::-1], process=False)
+    if mesh.volume < 0:
+        mesh.invert()
+    return mesh
 
 
 def _draw_solid(axes: Any, mesh: trimesh.Trimesh, colour: tuple[float, float, float]) -> None:
+    # Triangles are painted back to front by their middles: large ones must be cut to be in order.
+    vertices, faces = trimesh.remesh.subdivide_to_size(
+        mesh.vertices, mesh.faces, max_edge=float(mesh.extents.max()) / 12.0
+    )
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
     normals = np.asarray(mesh.face_normals)
     light = np.array([-0.35, -0.55, 0.76])
     level = 0.35 + 0.65 * np.clip(normals @ light, 0.0, 1.0)
@@ -543,8 +552,12 @@ def _draw_outline(axes: Any, mesh: trimesh.Trimesh) -> None:
 def figure_8(subject: Subject) -> Figure:
     """Draw the surfaces that carving leaves, by both methods, and the true target where it is known."""
     grids = [g for g in (subject.result.other_grid, subject.result.grid) if g is not None]
-    grids.sort(key=lambda g: g.method != "hard")  # the paper's order: segmented shadows first
-    titles = {"hard": "space carving on segmented shadows", "soft": "soft space carving"}
+    grids.sort(key=lambda g: g.method == "soft")  # the paper's order: segmented shadows first
+    titles = {
+        "hard": "space carving on segmented shadows",
+        "consensus": "consensus of segmented shadows",
+        "soft": "soft space carving",
+    }
     solids: list[tuple[str, trimesh.Trimesh, bool]] = []
     for grid in grids:
         mesh = _surface(grid)
@@ -563,7 +576,7 @@ def figure_8(subject: Subject) -> Figure:
     low[:2] -= margin
     high[:2] += margin
     size = high - low
-    figure = _new(5.4 * len(solids), 5.6)
+    figure = _new(5.4 * len(solids), 5.2)
     for i, (title, mesh, is_truth) in enumerate(solids):
         axes: Any = figure.add_subplot(1, len(solids), i + 1, projection="3d")
         _draw_solid(axes, mesh, (0.62, 0.75, 0.62) if is_truth else (0.93, 0.76, 0.42))
@@ -572,15 +585,17 @@ def figure_8(subject: Subject) -> Figure:
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
         axes.set_zlim(0.0, high[2])
-        axes.set_box_aspect(size, zoom=0.92)
+        axes.set_box_aspect(size, zoom=0.82)
         axes.view_init(elev=28, azim=-60)
         for axis, n in ((axes.xaxis, size[0]), (axes.yaxis, size[1]), (axes.zaxis, size[2])):
-            axis.set_major_locator(mpl.ticker.MaxNLocator(max(2, round(6 * n / size.max()))))
-        axes.set_xlabel("x (m)")
-        axes.set_ylabel("y (m)")
-        axes.set_zlabel("z (m)")
-        axes.set_title(f"({'abc'[i]}) {title}" + (" (red: its edges)" if is_truth else ""))
-    figure.suptitle("Surface left by the shadows, metres, scene frame")
+            axis.set_major_locator(mpl.ticker.MaxNLocator(max(2, round(5 * n / size.max()))))
+        axes.tick_params(labelsize=9, pad=1)
+        axes.set_xlabel("x (m)", labelpad=8)
+        axes.set_ylabel("y (m)", labelpad=8)
+        axes.set_zlabel("z (m)", labelpad=4)
+        axes.set_title(f"({'abc'[i]}) {title}", y=1.0)
+    red = "; red: edges of the true target" if truth is not None else ""
+    figure.suptitle(f"Surface left by the shadows (scene frame{red})")
     return figure
 
 
