@@ -109,7 +109,7 @@ class CsasNode(LifecycleNode):
         self.parameters: Any = from_overrides(NODES[self.name], given)
         declare(self, self.parameters)
         self.add_on_set_parameters_callback(self._on_set_parameters)
-        self.instance = uuid.uuid4().hex[:12]
+        self.instance = ""
         self.messages = RclpyMessages()
         self.active = False
         self.counts: Counter[str] = Counter()
@@ -312,6 +312,8 @@ class CsasNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Make everything; refuse with one line if that cannot be done."""
+        # Whatever an earlier configuration reported is forgotten with its state.
+        self.instance = uuid.uuid4().hex[:12]
         try:
             self._reports = self.publisher("progress", qos.REPORTS)
             self._heartbeats = self.publisher("progress", qos.HEARTBEAT)

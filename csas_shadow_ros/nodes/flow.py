@@ -94,6 +94,9 @@ class Flow:
         A view that vanishes so many times while others get through is lost.
     min_sinks : int
         Nothing is sent before so many sinks are there (or `sink_wait_s` is over).
+    settle_s : float
+        How long after the first subscriber or consumer the source listens before it sends: heartbeats and
+        kept reports tell it who reports, and what is done already.
     clock : callable
         Seconds; monotonic.
     """
@@ -105,6 +108,7 @@ class Flow:
     sink_wait_s: float = 60.0
     max_attempts: int = 5
     min_sinks: int = 0
+    settle_s: float = 1.0
     clock: Callable[[], float] = time.monotonic
     #: Lines to log, (level, text); the node takes them.
     notes: list[tuple[str, str]] = field(default_factory=list)
@@ -121,13 +125,14 @@ class Flow:
         self._in_flight: dict[int, _Sent] = {}
         self._missing: dict[int, None] = {}
         self._gone: dict[tuple[str, str], float] = {}
+        self._names: set[tuple[str, str]] = set()
         self._leaves: list[Peer] = []
         self._known_leaves: frozenset[str] = frozenset()
         self._done_count = 0
         self._serial = 0
         self._progress_s = self._born_s = self._served_s = self._looked_s = self.clock()
         self._subscribers = 0
-        self._told_wait = ""
+        self._met_s: float | None = None
 
     # What the source has
 
@@ -177,7 +182,8 @@ class Flow:
         return not stream or place_of(stream) >= place_of(self.stream)
 
     def _arrived(self, peer: Peer) -> None:
-        self._gone.pop((peer.node, peer.stream), None)
+        name = (peer.node, peer.stream)
+        self._gone.pop(name, None)
         if peer.role == "sink":
             # A process of this name before it died: its reports will never be asked for again.
             for other in list(self.peers.values()):
@@ -186,10 +192,12 @@ class Flow:
                     del self.peers[other.instance]
                     self._reports.pop(other.key, None)
         self.lost.clear()
-        # What was on its way while the consumer was not there may never have reached it.
-        for sent in self._in_flight.values():
-            sent.due, sent.attempts = True, 1
-        self._progress_s = self.clock()
+        if name in self._names:
+            # It was there and is there again: what was on its way meanwhile has probably died with it.
+            for sent in self._in_flight.values():
+                sent.due, sent.attempts = True, 1
+            self._progress_s = self.clock()
+        self._names.add(name)
 
     def _reported(self, peer: Peer, item: ViewProgress) -> None:
         stamp = item.stamp_ns
@@ -275,6 +283,8 @@ class Flow:
                 del self._gone[key]
                 self.notes.append(("warn", f"{key[0]} did not come back in {self.sink_wait_s:g} s; going on"))
         self._subscribers = subscribers
+        if self._met_s is None and (subscribers or self.peers):
+            self._met_s = now
         live = self.live()
         takers = {place_of(p.stream) for p in live}
         # A stage is last if nobody behind it reports: it stands for the unknown that follows it.
@@ -301,6 +311,8 @@ class Flow:
     def waiting_for(self) -> str:
         """Say what the source waits for before it sends anything; empty if for nothing."""
         now = self.clock()
+        if self._met_s is not None and now - self._met_s < self.settle_s:
+            return "whoever else is there to be heard"
         if self._gone and not self.sinks():
             return f"{', '.join(sorted(n for n, _ in self._gone))} to come back"
         if now - self._born_s < self.sink_wait_s and len(self.sinks()) < self.min_sinks:
