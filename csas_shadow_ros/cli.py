@@ -384,6 +384,8 @@ def _add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _add_replay(add: Callable[..., argparse.ArgumentParser]) -> None:
+    from .process import START_FROM
+
     p = add(
         "replay",
         "reconstruct the target of a bag through the ROS 2 nodes, and write the same results folder",
@@ -392,6 +394,19 @@ def _add_replay(add: Callable[..., argparse.ArgumentParser]) -> None:
         _replay,
     )
     p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
+    p.add_argument(
+        "--start-from",
+        choices=START_FROM,
+        default="auto",
+        help="image (or sectors) and track, or views of a stage; auto: the first that the bag holds",
+    )
+    p.add_argument(
+        "--rate",
+        type=float,
+        default=0.0,
+        metavar="R",
+        help="views: times the recorded speed; 0: as fast as the nodes take them (default 0)",
+    )
     _results_options(p)
     _parameter_options(p)
     _common(p)
@@ -582,7 +597,25 @@ def _give_report(arguments: argparse.Namespace, console: Console, report: dict[s
 
 
 def _replay(arguments: argparse.Namespace, console: Console) -> int:
-    raise CsasError("replay is not there yet")
+    from .process import replay_bag
+
+    parameters = parameters_of(arguments)
+    with console.bar("views") as bar:
+        report = replay_bag(
+            arguments.bag,
+            arguments.out,
+            parameters,
+            start_from=arguments.start_from,
+            rate=arguments.rate,
+            overwrite=arguments.overwrite,
+            write_bag=not arguments.no_bag,
+            figures=not arguments.no_figures,
+            command=arguments.command_line,
+            progress=bar,
+            notice=console.notice,
+        )
+    _give_report(arguments, console, report)
+    return OK
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -101,6 +102,82 @@ def process_bag(
         context.problems = [str(problem) for problem in run.problems]
         for problem in context.problems:
             notice(f"left out: {problem}")
+        context.input = describe_run(run)
+        return writer.finish(result, context)
+
+
+def replay_bag(
+    bag: str | Path,
+    out: str | Path,
+    parameters: PipelineParameters | None = None,
+    *,
+    start_from: str = "auto",
+    rate: float = 0.0,
+    overwrite: bool = False,
+    write_bag: bool = True,
+    figures: bool = True,
+    command: Sequence[str] = (),
+    progress: Progress | None = None,
+    notice: Notice = _ignore,
+) -> dict[str, Any]:
+    """Reconstruct the target of a bag through the node graph and write the same results folder.
+
+    Parameters
+    ----------
+    bag, out, parameters, start_from, overwrite, write_bag, figures, command, progress, notice
+        See `process_bag`.
+    rate : float
+        Views: times the recorded speed; 0: as fast as the nodes take them.
+
+    Returns
+    -------
+    dict
+        The report. The nodes' logs are in the folder's ``log/``.
+
+    Raises
+    ------
+    CsasError
+        As `process_bag`; and if ROS 2 is not there, or the graph does not get to its end.
+    """
+    from .results.recording import adopt_replay, node_table, unplaced
+
+    try:
+        import rclpy  # noqa: F401  (asked for here, to say so in one line)
+    except ImportError as error:
+        raise CsasError(
+            f"replay needs ROS 2, which is not there ({error}); source it or pip install 'csas_shadow_ros[ros]',"
+            " or use `csas-shadow run`"
+        ) from error
+    from .replay import replay
+
+    p = parameters or PipelineParameters()
+    with ResultsWriter(out, overwrite=overwrite, bag=write_bag, figures=figures) as writer:
+        began = time.perf_counter()
+        run = read_run(bag)
+        context = Context(p, command, truth=read_truth(bag))
+        context.timings_s["read"] = time.perf_counter() - began
+        scratch = writer.work / ".replay"
+        replayed = replay(
+            bag,
+            scratch,
+            p,
+            stage=start_from,
+            rate=rate,
+            record=True,
+            overrides={"bag_recorder": {"compress": False}},
+            progress=progress or False,
+            notice=notice,
+        )
+        context.stage = "image" if replayed.stage == "sector" else replayed.stage
+        if context.stage == "image":
+            context.image = run.coherent_image()
+        context.track = run.track
+        context.nodes, context.views_lost = node_table(replayed), replayed.lost
+        context.views_in = replayed.views_total
+        result = adopt_replay(writer, replayed, p)
+        (scratch / "log").rename(writer.work / "log")
+        shutil.rmtree(scratch)
+        context.problems = [*(str(problem) for problem in run.problems), *unplaced(replayed)]
         context.input = describe_run(run)
         return writer.finish(result, context)
 

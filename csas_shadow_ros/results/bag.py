@@ -47,6 +47,7 @@ class ResultBag:
         self._writer = BagWriter(self._work, compress="lz4", file_name=self.FILE)
         self._acoustics: Acoustics | None = None
         self._last_ns = 0
+        self._adopted = False
         names = [*_LATCHED, *(f"{s}/{kind}" for s in _LATCHED_STREAMS for kind in ("image", "camera_info"))]
         for name in names:
             self._writer.add_topic(absolute_name(name), TOPICS[name].type_name, depth=1)
@@ -97,14 +98,30 @@ class ResultBag:
         self._last_ns = max(self._last_ns, view.info.stamp_ns)
         self._acoustics = self._acoustics or view.info.acoustics
 
+    def adopt(self, recording: Path) -> None:
+        """Take over a recording of the node graph, which holds everything already."""
+        from .recording import copy_recording
+
+        copy_recording(recording, self._writer)
+        self._adopted = True
+
     def finish(self, result: Result) -> Path:
-        """Write composites, grid, voxels, mesh and target, and close.
+        """Write composites, grid, voxels, mesh and target (unless a recording has them), and close.
 
         Returns
         -------
         Path
             The file.
         """
+        if not self._adopted:
+            self._write_result(result)
+        self._writer.close()
+        path = self._folder / self.FILE
+        self._writer.file.replace(path)
+        shutil.rmtree(self._work)
+        return path
+
+    def _write_result(self, result: Result) -> None:
         factory, when = self._factory, self._last_ns
         if result.composites is not None and result.composites.stamps and self._acoustics is not None:
             info = GroundInfo(when, result.composites.grid, self._acoustics)
@@ -128,11 +145,6 @@ class ResultBag:
         box = None if grid is None else TargetBox.of(grid.volume)
         self._write("target", target_to_msg(factory, box, when))
         self._write("mesh", mesh_to_msg(factory, result.mesh, when))
-        self._writer.close()
-        path = self._folder / self.FILE
-        self._writer.file.replace(path)
-        shutil.rmtree(self._work)
-        return path
 
     def abandon(self) -> None:
         """Close what has been written; the folder is not going to be kept."""

@@ -81,6 +81,8 @@ class ResultsWriter:
         self._keeper = Keeper()
         self._aspects_deg: dict[int, float] = {}
         self._sonar_m: dict[int, Any] = {}
+        #: Where things may lie that are moved or removed before the folder is finished.
+        self.work = self._work
         #: Seconds spent in writing views.
         self.view_seconds = 0.0
 
@@ -120,18 +122,31 @@ class ResultsWriter:
     def add_view(self, view: AnyView) -> None:
         """Take one processed view: the `on_view` of `pipeline.run` and `stages.run_views`."""
         start = time.perf_counter()
-        self._keeper.add(view)
+        self.show_view(view)
         for stream, attribute in _STREAMS.items():
             one: View | None = getattr(view, attribute)
             if one is None:
                 continue
-            stamp = one.info.stamp_ns
-            if stamp not in self._aspects_deg:
-                self._aspects_deg[stamp] = float(np.degrees(one.info.aspect_rad) % 360.0)
-                self._sonar_m[stamp] = one.info.camera.sonar_m
+            self.note_view(one)
             if self._bag is not None:
                 self._bag.write_view(one, stream)
         self.view_seconds += time.perf_counter() - start
+
+    def show_view(self, view: AnyView) -> None:
+        """Take one processed view for the figures alone."""
+        self._keeper.add(view)
+
+    def note_view(self, view: View) -> None:
+        """Note where a view looked and where its sonar was."""
+        stamp = view.info.stamp_ns
+        if stamp not in self._aspects_deg:
+            self._aspects_deg[stamp] = float(np.degrees(view.info.aspect_rad) % 360.0)
+            self._sonar_m[stamp] = view.info.camera.sonar_m
+
+    def adopt_bag(self, recording: Path) -> None:
+        """Take a recording of the node graph as ``result.mcap``."""
+        if self._bag is not None:
+            self._bag.adopt(recording)
 
     def finish(self, result: Result, context: Context) -> dict[str, Any]:
         """Write everything else and put the folder in its place.

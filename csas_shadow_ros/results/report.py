@@ -51,6 +51,12 @@ class Context:
         What is really there.
     timings_s : dict
         Seconds of the steps round the method.
+    views_in : int or None
+        Views that there were, if that is known otherwise than from the result.
+    views_lost : int
+        Views that vanished on their way through a graph.
+    nodes : mapping or None
+        What each node says of its part, if the run went through the node graph.
     """
 
     parameters: PipelineParameters = field(default_factory=PipelineParameters)
@@ -63,6 +69,9 @@ class Context:
     problems: Sequence[str] = ()
     truth: KnownTruth | None = None
     timings_s: dict[str, float] = field(default_factory=dict)
+    views_in: int | None = None
+    views_lost: int = 0
+    nodes: Mapping[str, Any] | None = None
 
 
 def json_ready(value: Any) -> Any:
@@ -142,6 +151,14 @@ def _levels(
 
 def _sign(result: Result, context: Context) -> dict[str, Any]:
     override = context.spectrum_sign_override
+    if result.sign is None and context.nodes is not None and context.image is not None:
+        checked = context.parameters.sub_aperture.check_sign
+        return {
+            "stated": context.image.acoustics.spectrum_sign,
+            "verdict": "not contradicted" if checked else "not checked",
+            "why": "node sub_aperture found no contradiction" if checked else "check_sign is off",
+            "override": override,
+        }
     if result.sign is None:
         why = "there is no image to check it on" if context.image is None else "check_sign is off"
         stated = context.image.acoustics.spectrum_sign if context.image is not None else None
@@ -207,9 +224,10 @@ def build_report(
         "other_method": {"grid": _grid(result.other_grid), "dimensions": _dimensions(other)},
         "truth": truth,
         "views": {
-            "in": max(used + lost, composed),
+            "in": max(used + lost, composed) if context.views_in is None else context.views_in,
             "used": used,
             "rejected": lost,
+            "lost": context.views_lost,
             "reasons": dict(Counter(_kind(r) for r in result.rejected.values()).most_common()),
             "rejected_by_aspect_deg": {f"{a:g}": r for a, r in sorted(result.rejected.items())},
         },
@@ -217,6 +235,8 @@ def build_report(
         "spectrum_sign": _sign(result, context),
         "timings_s": {**result.timings_s, **context.timings_s},
         "stage": context.stage,
+        "through": "one process" if context.nodes is None else "node graph",
+        "nodes": context.nodes,
         "input": context.input,
         "problems": list(context.problems),
         "parameters": dataclasses.asdict(context.parameters),
@@ -274,7 +294,7 @@ def summary(report: Mapping[str, Any]) -> str:
         for label, key, unit in rows:
             values = [d["position_m"][key] if isinstance(key, int) else d[key] for d in (mine, true) if d]
             digits = 1 if unit == "°" else 4 if unit == "m³" else 3
-            cells = [f"{value:.{digits}f} {unit}" for value in values]
+            cells = [f"{round(value, digits) + 0.0:.{digits}f} {unit}" for value in values]  # no -0
             if not mine:
                 cells.insert(0, "-")
             line = f"{label:<14}" + "".join(f"{cell:>12}" for cell in cells)
@@ -296,6 +316,8 @@ def summary(report: Mapping[str, Any]) -> str:
         threshold = "none" if grid["threshold"] is None else f"{grid['threshold']:.4f}"
         lines.append(f"{grid['method']} carving, voxels of {grid['voxel_size_m']:g} m, threshold {threshold}")
     lines.append(f"views: {views['in']} in, {views['used']} in the grid, {views['rejected']} not used")
+    if views["lost"]:
+        lines[-1] += f", {views['lost']} lost on their way"
     lines += [f"  {n} not used: {reason}" for reason, n in views["reasons"].items()]
     sign = report["spectrum_sign"]
     lines.append(
