@@ -613,6 +613,8 @@ class Track:
             arcs.append((float(start % TWO_PI), abs(closing)))
         if not arcs:
             return (AspectGap(0.0, TWO_PI),)
+        # An arc across 0 covers the beginning of the circle as well.
+        arcs += [(start - TWO_PI, width) for start, width in arcs if start + width > TWO_PI]
         arcs.sort()
         gaps = []
         first = reach = arcs[0][0]
