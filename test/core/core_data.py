@@ -54,7 +54,7 @@ def nominal_grazing():
 
 
 def image_of_spectrum(values, grid, sign=1):
-    """Return the image I(x, y) = Σ S exp(j (Kx x + Ky y)) of S on the grid's own lattice, phases at the origin."""
+    """Return I(x, y) = Σ S exp(j (Kx x + Ky y)), S on the grid's own lattice, phases at the origin."""
     kx, ky = wavenumber_lattice(grid)
     shifted = values * np.exp(1j * (kx * grid.x_min_m + ky * grid.y_max_m))
     pixels = np.fft.ifft2(shifted) * shifted.size
@@ -82,7 +82,9 @@ def point_image(position_m, sign=1, rows=320, cols=384, centre=(0.1, -0.05)):
     return image_of_spectrum(phase * ((k > low) & (k < high)) / 1e3, grid, sign)
 
 
-REFERENCE_FACTOR = 4
+def factor_of(aperture_deg):
+    """How many times coarser than the image the views are that are compared with the literal ones."""
+    return 4 if aperture_deg <= 12.0 else 3
 
 
 @lru_cache(maxsize=4)
@@ -100,24 +102,26 @@ def faded_image(sign=1):
 
 @lru_cache(maxsize=8)
 def sub_apertures(sign=1, aperture_deg=12.0, faded=False):
-    parameters = SubApertureParameters(aperture_deg=aperture_deg, spacing_m=REFERENCE_FACTOR * SPACING_M)
+    parameters = SubApertureParameters(
+        aperture_deg=aperture_deg, spacing_m=factor_of(aperture_deg) * SPACING_M
+    )
     image = faded_image(sign) if faded else band_limited_image(sign)
     return SubApertures(image, circle_track(), parameters)
 
 
-def fine_camera(camera):
-    """Return the same camera with REFERENCE_FACTOR times finer pixels."""
+def fine_camera(camera, factor):
+    """Return the same camera with `factor` times finer pixels."""
     a = camera.ground_to_pixel.copy()
-    a[:2] *= REFERENCE_FACTOR
-    return ShadowCamera.from_ground(a, camera.sonar_m, *(REFERENCE_FACTOR * n for n in camera.shape))
+    a[:2] *= factor
+    return ShadowCamera.from_ground(a, camera.sonar_m, *(factor * n for n in camera.shape))
 
 
 @lru_cache(maxsize=32)
 def view_and_reference(sign, aspect_deg, aperture_deg=12.0, faded=False):
-    """Return a fast view and the literal full-size one (in the view frame, on its carrier, finely sampled)."""
+    """Return a fast view and the literal full-size one (view frame, on its carrier, finely sampled)."""
     image, aspect = faded_image(sign) if faded else band_limited_image(sign), math.radians(aspect_deg)
     view = sub_apertures(sign, aperture_deg, faded).view_of_aspect(aspect)
-    camera = fine_camera(view.info.camera)
+    camera = fine_camera(view.info.camera, factor_of(aperture_deg))
     full = reference.sub_aperture(image, aspect, math.radians(aperture_deg))
     return view, reference.rotate_to_view(full, image, camera, aspect), camera
 
@@ -135,8 +139,17 @@ def on_carrier(view):
     return view.pixels * np.exp(1j * (kx * x + ky * y))
 
 
-def make_info(aspect_rad, *, size=128, spacing_m=0.02, centre=(0.0, 0.0), stamp_ns=None, sonar_m=None, sign=1,
-              aperture_deg=12.0):
+def make_info(
+    aspect_rad,
+    *,
+    size=128,
+    spacing_m=0.02,
+    centre=(0.0, 0.0),
+    stamp_ns=None,
+    sonar_m=None,
+    sign=1,
+    aperture_deg=12.0,
+):
     """Return the geometry of a square view on the nominal circle."""
     if sonar_m is None:
         sonar_m = (RADIUS_M * math.cos(aspect_rad), RADIUS_M * math.sin(aspect_rad), HEIGHT_M)
@@ -175,6 +188,7 @@ def _segment_starts(x, y, sonar_m, top_m):
     return sonar_m[0] + t * (x - sonar_m[0]), sonar_m[1] + t * (y - sonar_m[1])
 
 
+@lru_cache(maxsize=8)
 def hull_of(hidden, infos, volume):
     """Return the voxels whose shadow points are hidden in every view: exact, without any image."""
     z, y, x = np.meshgrid(volume.z_m, volume.y_m, volume.x_m, indexing="ij")
@@ -186,6 +200,7 @@ def hull_of(hidden, infos, volume):
     return alive
 
 
+@lru_cache(maxsize=8)
 def perfect_views(hidden, infos, kind):
     """Return shadow views without noise: 'mask' (uint8 255/0) or 'likelihood' (float32 0/1)."""
     views = []
@@ -193,7 +208,7 @@ def perfect_views(hidden, infos, kind):
         dark = hidden(*ground_of_pixels(info.camera), info.camera.sonar_m)
         pixels = np.where(dark, 255, 0).astype(np.uint8) if kind == "mask" else (~dark).astype(np.float32)
         views.append(View(info, pixels))
-    return views
+    return tuple(views)
 
 
 def normalised_rms(a, b, where):

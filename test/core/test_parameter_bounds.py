@@ -11,7 +11,6 @@ import pytest
 from csas_shadow_ros.core.errors import CsasError, ParameterError, check_range
 from csas_shadow_ros.core.parameters import (
     STAGES,
-    CarvingParameters,
     LikelihoodParameters,
     Parameters,
     PipelineParameters,
@@ -21,7 +20,9 @@ from csas_shadow_ros.core.parameters import (
 )
 
 FIELDS = [(cls, field) for cls in STAGES.values() for field in dataclasses.fields(cls)]
-NUMBERS = [(c, f) for c, f in FIELDS if isinstance(f.default, int | float) and not isinstance(f.default, bool)]
+NUMBERS = [
+    (c, f) for c, f in FIELDS if isinstance(f.default, int | float) and not isinstance(f.default, bool)
+]
 TUPLES = [(c, f) for c, f in FIELDS if isinstance(f.default, tuple)]
 TEXTS = [(c, f) for c, f in FIELDS if isinstance(f.default, str)]
 FLAGS = [(c, f) for c, f in FIELDS if isinstance(f.default, bool)]
@@ -88,7 +89,9 @@ def test_a_text_is_one_of_its_choices(cls, field):
     for choice in field.metadata["choices"]:
         assert getattr(cls(**{field.name: choice}), field.name) == choice
     for value in ("nonsense", field.default.upper(), ""):
-        with pytest.raises(ParameterError, match=rf"{field.name} is '{value}'; expected one of: .*{field.default}"):
+        with pytest.raises(
+            ParameterError, match=rf"{field.name} is '{value}'; expected one of: .*{field.default}"
+        ):
             cls(**{field.name: value})
     with pytest.raises(ParameterError, match=rf"{field.name} is 3; expected one of"):
         cls(**{field.name: 3})
@@ -114,12 +117,16 @@ def test_a_whole_number_is_held_to_its_bounds_too(value):
 
 
 def test_an_unknown_name_is_refused_and_the_known_ones_are_told():
-    with pytest.raises(ParameterError, match=r"unknown parameter 'apperture'; expected one of: aperture_deg, step"):
+    with pytest.raises(
+        ParameterError, match=r"unknown parameter 'apperture'; expected one of: aperture_deg, step"
+    ):
         SubApertureParameters.from_mapping({"apperture": 3})
 
 
 def test_the_refusal_tells_value_bounds_and_unit():
-    with pytest.raises(ParameterError, match=r"aperture_deg is 100 deg; expected a number in \[0.5, 90\] deg"):
+    with pytest.raises(
+        ParameterError, match=r"aperture_deg is 100 deg; expected a number in \[0.5, 90\] deg"
+    ):
         SubApertureParameters(aperture_deg=100)
     with pytest.raises(ParameterError, match=r"echo_db is -1 dB; expected a number in \[1, 60\] dB"):
         LikelihoodParameters(echo_db=-1)
@@ -137,10 +144,9 @@ def test_the_pipeline_holds_one_set_a_stage():
         assert getattr(p, name) == cls()
 
 
-def test_the_defaults_are_the_paper_s():
+def test_the_defaults_of_the_views_are_the_paper_s():
     assert (SubApertureParameters().aperture_deg, SubApertureParameters().step_deg) == (12.0, 1.0)
     assert SubApertureParameters().taper == "none"
-    assert CarvingParameters().method == "soft"
     assert TargetParameters().target == "auto"
 
 

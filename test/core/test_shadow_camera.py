@@ -79,7 +79,11 @@ def test_k_and_r_are_the_decomposition_of_p(aspect_deg, scale):
     assert k[2, 2] == 1.0
     assert np.abs(k[np.tril_indices(3, -1)]).max() < 1e-9 * np.abs(k).max()
     again = k @ r @ np.column_stack([np.eye(3), -camera.sonar_m])
-    factor = camera.projection[0, 0] / again[0, 0] if abs(again[0, 0]) > 1 else camera.projection[1, 0] / again[1, 0]
+    factor = (
+        camera.projection[0, 0] / again[0, 0]
+        if abs(again[0, 0]) > 1
+        else camera.projection[1, 0] / again[1, 0]
+    )
     assert camera.projection / factor == pytest.approx(again, rel=1e-9, abs=1e-6 * np.abs(again).max())
 
 
@@ -273,7 +277,9 @@ def test_a_step_that_does_not_divide_the_circle_is_refused(step):
 def focused(aspect, target):
     info = make_info(aspect)
     r0 = -(target[0] * math.cos(aspect) + target[1] * math.sin(aspect))
-    return info.__class__(info.stamp_ns, info.camera, info.acoustics, aspect, info.aperture_rad, (0.0, 0.0), r0)
+    return info.__class__(
+        info.stamp_ns, info.camera, info.acoustics, aspect, info.aperture_rad, (0.0, 0.0), r0
+    )
 
 
 @given(st.lists(angles, min_size=2, max_size=6), offsets, offsets)
@@ -286,7 +292,9 @@ def test_the_target_cannot_be_fitted_to_views_without_focus_or_of_one_aspect():
     with pytest.raises(GeometryError, match="0 views have a focus range"):
         fit_target_to_focus([make_info(0.0), make_info(1.0)])
     with pytest.raises(GeometryError, match="all look the same way"):
-        fit_target_to_focus([focused(1.0, (0.1, 0.2)), focused(1.0, (0.1, 0.2)), focused(1.0 + math.pi, (0.1, 0.2))])
+        fit_target_to_focus(
+            [focused(1.0, (0.1, 0.2)), focused(1.0, (0.1, 0.2)), focused(1.0 + math.pi, (0.1, 0.2))]
+        )
 
 
 def test_pixels_of_another_shape_than_their_geometry_are_refused():

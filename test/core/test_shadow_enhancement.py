@@ -28,7 +28,9 @@ def rms_difference(a, b, where):
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("aspect_deg", [0.0, 33.0, 45.0, 141.7, 270.0])
 @pytest.mark.parametrize(("parameters", "target"), [(EXACT, TARGET), (SMALL, TARGET), (EXACT, (-0.4, 0.3))])
-def test_enhancement_is_the_literal_filter_within_2_percent_away_from_borders(sign, aspect_deg, parameters, target):
+def test_enhancement_is_the_literal_filter_within_2_percent_away_from_borders(
+    sign, aspect_deg, parameters, target
+):
     view, literal, camera = view_and_reference(sign, aspect_deg, faded=True)
     shadow = enhance(view, target, parameters)
     aspect = math.radians(aspect_deg)
@@ -77,7 +79,9 @@ def test_an_enhanced_view_keeps_its_stamp_and_geometry_and_tells_its_focus():
     assert shadow.pixels.dtype == np.float32
     assert shadow.info.stamp_ns == view.info.stamp_ns
     assert shadow.info.camera is view.info.camera
-    assert shadow.info.focus_range_m == pytest.approx(-(0.3 * math.cos(0.57595865) - 0.2 * math.sin(0.57595865)))
+    assert shadow.info.focus_range_m == pytest.approx(
+        -(0.3 * math.cos(0.57595865) - 0.2 * math.sin(0.57595865))
+    )
     assert (shadow.pixels[np.isfinite(shadow.pixels)] >= 0).all()
 
 
@@ -177,7 +181,7 @@ def test_views_that_cannot_be_enhanced_are_refused():
 
 
 def mean_power(run, parameters, *, aperture_deg=12.0, lie_about_sign=False):
-    """Mean power of the views of a target that looks the same from everywhere, rows down-range, and its axes."""
+    """Mean power of the views of a target that looks the same from everywhere, and its axes."""
     p = SubApertureParameters(aperture_deg=aperture_deg, step_deg=5.0, spacing_m=0.02)
     sa = SubApertures(run.image, run.track, p, spectrum=Spectrum.of_image(run.image))
     total = count = 0
@@ -216,7 +220,7 @@ def edge_width(power, r, across, span):
 
 
 def test_enhancement_sharpens_shadow_edges_and_a_wrong_sign_doubles_their_blur(drum_run):
-    # The drum is 0.4 m wide and 0.3 m high: its shadow's sides are straight to 0.3 · 30/11.7 = 0.77 m behind it.
+    # The drum is 0.4 m wide and 0.3 m high: its shadow's sides are straight to 0.3 · 30/11.7 = 0.77 m.
     span, aperture = (0.5, 0.74), 24.0
     sharp = edge_width(*mean_power(drum_run, EXACT, aperture_deg=aperture), span)
     plain = edge_width(*mean_power(drum_run, NONE, aperture_deg=aperture), span)

@@ -44,7 +44,7 @@ def test_the_fast_view_is_the_literal_one_within_2_percent_away_from_borders(sig
 def test_a_wide_aperture_is_the_literal_one_too():
     view, literal, _ = view_and_reference(1, 33.0, 40.0)
     inside = scipy.ndimage.binary_erosion(np.isfinite(view.pixels), iterations=8)
-    assert normalised_rms(on_carrier(view), literal[::4, ::4], inside) < 0.02
+    assert normalised_rms(on_carrier(view), literal[::3, ::3], inside) < 0.02
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -52,7 +52,10 @@ def test_a_wide_aperture_is_the_literal_one_too():
 def test_a_view_on_its_carrier_is_the_true_image_at_those_points(sign, aspect_deg):
     grid = GroundGrid.centred(300, 360, SPACING_M, (1.3, -0.7))
     kx, ky = wavenumber_lattice(grid)
-    k, look = np.hypot(kx, ky), np.angle(np.exp(1j * (np.arctan2(sign * ky, sign * kx) - math.radians(aspect_deg))))
+    k, look = (
+        np.hypot(kx, ky),
+        np.angle(np.exp(1j * (np.arctan2(sign * ky, sign * kx) - math.radians(aspect_deg)))),
+    )
     low, _, high = acoustics().ground_band(nominal_grazing())
     band = (k > low + 5) & (k < high - 5)
     rng = np.random.default_rng(1)
@@ -61,9 +64,9 @@ def test_a_view_on_its_carrier_is_the_true_image_at_those_points(sign, aspect_de
     values = np.zeros(k.size, complex)
     values[chosen] = np.exp(2j * np.pi * rng.random(12))
     values[others] = 3.0
-    view = SubApertures(image_of_spectrum(values.reshape(k.shape), grid, sign), circle_track()).view_of_aspect(
-        math.radians(aspect_deg)
-    )
+    view = SubApertures(
+        image_of_spectrum(values.reshape(k.shape), grid, sign), circle_track()
+    ).view_of_aspect(math.radians(aspect_deg))
     x, y = ground_of_pixels(view.info.camera)
     truth = np.zeros(x.shape, complex)
     for i in chosen:
@@ -77,7 +80,10 @@ def test_the_carrier_lies_in_the_middle_of_the_wedge_on_the_side_the_sign_says(a
     for sign in (1, -1):
         info = sub_apertures(sign).info(math.radians(aspect_deg))
         along = sign * np.asarray(info.carrier_rad_m) @ unit_to_sonar(math.radians(aspect_deg))
-        across = np.asarray(info.carrier_rad_m) @ (-math.sin(math.radians(aspect_deg)), math.cos(math.radians(aspect_deg)))
+        across = np.asarray(info.carrier_rad_m) @ (
+            -math.sin(math.radians(aspect_deg)),
+            math.cos(math.radians(aspect_deg)),
+        )
         assert low < along < high
         assert abs(along - mid) < 0.05 * mid
         assert abs(across) < 5.0
@@ -185,7 +191,10 @@ def test_the_response_to_a_point_is_as_wide_as_the_wedge_says_along_both_axes(ap
     amplitude = np.nan_to_num(np.abs(view.pixels))
     row, col = np.unravel_index(amplitude.argmax(), amplitude.shape)
     n = round(0.25 / sa.spacing_m)
-    for samples, theory in ((amplitude[row - n : row + n, col], along), (amplitude[row, col - n : col + n], across)):
+    for samples, theory in (
+        (amplitude[row - n : row + n, col], along),
+        (amplitude[row, col - n : col + n], across),
+    ):
         assert response_width(samples, sa.spacing_m) == pytest.approx(
             response_width(np.array(theory), 0.002), rel=0.04
         )
@@ -243,9 +252,13 @@ def test_the_views_are_as_many_as_the_step_says_and_have_stamps_of_their_own():
 def test_a_view_in_a_gap_of_the_track_is_refused_with_aspect_and_coverage():
     track = circle_track(keep=lambda d: not 80 < d < 110)
     sa = SubApertures(band_limited_image(), track)
-    with pytest.raises(ViewError, match=r"track gap: the track covers 0% of the 12° aperture at aspect 95.0°"):
+    with pytest.raises(
+        ViewError, match=r"track gap: the track covers 0% of the 12° aperture at aspect 95.0°"
+    ):
         sa.view(95)
-    with pytest.raises(ViewError, match=r"track gap: the track covers 67% .* aspect 78.0°; expected at least 75%"):
+    with pytest.raises(
+        ViewError, match=r"track gap: the track covers 67% .* aspect 78.0°; expected at least 75%"
+    ):
         sa.view(78)
     assert np.isfinite(sa.view(76).pixels).any()
     lenient = SubApertures(band_limited_image(), track, SubApertureParameters(min_coverage=0.5))
@@ -288,7 +301,9 @@ def test_an_unknown_taper_is_refused():
 def test_a_tapered_view_has_the_energy_of_its_taper(name):
     image = band_limited_image()
     power = [
-        np.nanmean(np.abs(SubApertures(image, circle_track(), SubApertureParameters(taper=t)).view(20).pixels) ** 2)
+        np.nanmean(
+            np.abs(SubApertures(image, circle_track(), SubApertureParameters(taper=t)).view(20).pixels) ** 2
+        )
         for t in ("none", name)
     ]
     expected = float(np.mean(taper_table(name).astype(float) ** 2))
@@ -298,7 +313,9 @@ def test_a_tapered_view_has_the_energy_of_its_taper(name):
 def test_a_taper_lowers_the_cross_range_sidelobes_and_widens_the_main_lobe():
     def cut(taper):
         parameters = SubApertureParameters(aperture_deg=12.0, taper=taper, oversampling=4.0)
-        amplitude = np.nan_to_num(np.abs(SubApertures(point_image((0.1, -0.05)), circle_track(), parameters).view(0).pixels))
+        amplitude = np.nan_to_num(
+            np.abs(SubApertures(point_image((0.1, -0.05)), circle_track(), parameters).view(0).pixels)
+        )
         row, _ = np.unravel_index(amplitude.argmax(), amplitude.shape)
         return amplitude[row] / amplitude.max()
 
@@ -309,12 +326,14 @@ def test_a_taper_lowers_the_cross_range_sidelobes_and_widens_the_main_lobe():
 
 
 def test_a_size_that_does_not_transform_fast_gives_the_same_views():
-    """A point on an image of prime size, zero-padded by the fast path, is where and what it is on a round one."""
+    """A point on an image of prime size, which is padded, is where and what it is on a round one."""
     grid = GroundGrid.centred(331, 389, SPACING_M, (0.1, -0.05))
     big = point_image((0.12, -0.03), rows=400, cols=400)
     dv = round((big.grid.y_max_m - grid.y_max_m) / SPACING_M - 0.5)
     du = round((grid.x_min_m - big.grid.x_min_m) / SPACING_M - 0.5)
-    grid = GroundGrid(331, 389, SPACING_M, float(big.grid.x_of_columns()[du]), float(big.grid.y_of_rows()[dv]))
+    grid = GroundGrid(
+        331, 389, SPACING_M, float(big.grid.x_of_columns()[du]), float(big.grid.y_of_rows()[dv])
+    )
     cropped = CoherentImage(big.pixels[dv : dv + 331, du : du + 389], grid, big.acoustics)
     parameters = SubApertureParameters(extent_m=0.8)
     a = SubApertures(big, circle_track(), parameters).view_of_aspect(0.6)
@@ -324,6 +343,8 @@ def test_a_size_that_does_not_transform_fast_gives_the_same_views():
     near = np.hypot(x - 0.12, y + 0.03) < 0.2
     at = b.info.camera.ground_to_pixel @ np.stack([x[near], y[near], np.ones(near.sum())])
     kx, ky = b.info.carrier_rad_m
-    filled = scipy.ndimage.map_coordinates(b.pixels, [at[1], at[0]], order=3) * np.exp(1j * (kx * x[near] + ky * y[near]))
+    filled = scipy.ndimage.map_coordinates(b.pixels, [at[1], at[0]], order=3) * np.exp(
+        1j * (kx * x[near] + ky * y[near])
+    )
     truth = on_carrier(a)[near]
     assert normalised_rms(filled, truth, np.ones(truth.shape, bool)) < 0.08

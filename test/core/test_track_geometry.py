@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -16,13 +17,15 @@ from csas_shadow_ros.core.geometry import Track, unit_to_sonar, wrap_angle
 
 def track_at(degrees, **kwargs):
     a = np.radians(degrees)
-    return Track(np.arange(len(a)) * 10**9, np.c_[30 * np.cos(a), 30 * np.sin(a), np.full(len(a), 12.0)], **kwargs)
+    return Track(
+        np.arange(len(a)) * 10**9, np.c_[30 * np.cos(a), 30 * np.sin(a), np.full(len(a), 12.0)], **kwargs
+    )
 
 
 def brute_covered(track, points):
     """Say which aspects lie between two neighbouring poses at most max_gap apart (or in the closing step)."""
     a = track.aspects_rad
-    pairs = list(zip(a[:-1], a[1:], strict=True))
+    pairs = list(pairwise(a))
     closing = float(wrap_angle(a[0] - a[-1]))
     if abs(a[-1] - a[0]) > math.pi:
         pairs.append((a[-1], a[-1] + closing))
@@ -80,7 +83,7 @@ def test_poses_too_far_apart_cover_nothing():
 steps = st.lists(st.sampled_from([-4.0, -0.7, 0.9, 1.3, 2.6, 2.9, 3.1, 7.0, 40.0]), min_size=6, max_size=60)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.floats(0, 360), steps, st.floats(0, 360), st.floats(2.0, 90.0))
 def test_covered_fraction_is_what_counting_finds(start_deg, steps_deg, aspect_deg, width_deg):
     track = track_at(start_deg + np.r_[0.0, np.cumsum(steps_deg)])
@@ -91,7 +94,7 @@ def test_covered_fraction_is_what_counting_finds(start_deg, steps_deg, aspect_de
     )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.floats(0, 360), steps)
 def test_coverage_is_what_counting_finds(start_deg, steps_deg):
     track = track_at(start_deg + np.r_[0.0, np.cumsum(steps_deg)])
@@ -99,7 +102,7 @@ def test_coverage_is_what_counting_finds(start_deg, steps_deg):
     assert track.coverage_rad / (2 * math.pi) == pytest.approx(brute_covered(track, points).mean(), abs=2e-3)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.floats(0, 360), steps, st.floats(0, 360))
 def test_at_aspect_answers_exactly_where_the_track_covers(start_deg, steps_deg, aspect_deg):
     track = track_at(start_deg + np.r_[0.0, np.cumsum(steps_deg)])
@@ -112,6 +115,11 @@ def test_at_aspect_answers_exactly_where_the_track_covers(start_deg, steps_deg, 
     elif not near.any() and np.abs(wrap_angle(track.aspects_rad - aspect)).min() > 1e-6:
         with pytest.raises(TrackError, match=r"no pose at aspect"):
             track.at_aspect(aspect)
+
+
+def test_an_arc_that_wraps_round_covers_the_beginning_of_the_circle_too():
+    track = track_at([0.0, -4.0, -1.1, 1.8, -2.2, 0.9, 0.2])
+    assert track.covered_fraction(0.0, math.radians(2.0)) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("clockwise", [False, True])
