@@ -30,12 +30,14 @@ from csas_shadow_ros.bags import read_run, write_run
 from csas_shadow_ros.core.composites import Composites, level_image
 from csas_shadow_ros.core.errors import CsasError
 from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, Track
-from csas_shadow_ros.core.parameters import TargetParameters
+from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters
+from csas_shadow_ros.core.pipeline import Result, run
 from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
-from csas_shadow_ros.core.target import SignEvidence, Target, choose_target, spectrum_sign_evidence
 
 FILE = "airsas_small_features_cutout_20k_mic1.npy"
 EPOCH_NS = 1_700_000_000_000_000_000
+#: The scene is 0.6 m across.
+VOXEL_M = 0.005
 
 
 def load_run(path: Path) -> tuple[CoherentImage, Track]:
@@ -75,39 +77,27 @@ def energy_in_band(image: CoherentImage, track: Track) -> tuple[float, float, fl
 
 @dataclass(eq=False)
 class Outcome:
-    """What the example makes of the run."""
+    """What the example makes of the run: some views by aspect (deg), and the whole chain's result."""
 
     image: CoherentImage
     track: Track
     views: dict[float, NDArray[np.complex64]]
     extent_m: float
     composites: Composites
-    sign: SignEvidence
-    target: Target | None
+    result: Result
 
 
 def process(bag: Path, shown_deg: tuple[float, ...] = ()) -> Outcome:
-    """Make every sub-aperture of a bag's image (12° wide, every degree) and the composites of them."""
-    run = read_run(bag)
-    image, track = run.coherent_image(), run.require_track()
-    spectrum = Spectrum.of_image(image)
-    sub_apertures = SubApertures(image, track, spectrum=spectrum)
-    composites: Composites | None = None
-    shown = {}
-    for index in range(len(sub_apertures)):
-        view = sub_apertures.view(index)
-        composites = composites or Composites.for_view(view)
-        composites.integrate(view)
-        degrees = round(math.degrees(view.info.aspect_rad), 6)
-        if degrees in shown_deg:
-            shown[degrees] = view.pixels
-    if composites is None:
-        raise CsasError(f"{bag} gave no view; expected {len(sub_apertures)}")
-    sign, search = spectrum_sign_evidence(image, track, spectrum=spectrum)
-    target = choose_target(search, TargetParameters())
-    return Outcome(
-        image, track, shown, sub_apertures.size * sub_apertures.spacing_m, composites, sign, target
-    )
+    """Run the whole chain on a bag (sub-apertures 12° wide, every degree), and keep some of the views."""
+    recorded = read_run(bag)
+    image, track = recorded.coherent_image(), recorded.require_track()
+    result = run(image, track, PipelineParameters(carving=CarvingParameters(voxel_size_m=VOXEL_M)))
+    if result.composites is None:
+        raise CsasError(f"{bag} gave no view: {next(iter(result.rejected.values()), 'no reason given')}")
+    sub_apertures = SubApertures(image, track)
+    views = {d: sub_apertures.view_of_aspect(math.radians(d)).pixels for d in shown_deg}
+    extent = sub_apertures.size * sub_apertures.spacing_m
+    return Outcome(image, track, views, extent, result.composites, result)
 
 
 def _pyplot() -> Any:
@@ -178,8 +168,11 @@ def main(argv: list[str] | None = None) -> int:
         low, high, share = energy_in_band(image, track)
         print(f"{bag}: band {low:.0f} to {high:.0f} rad/m holds {share:.1%} of the energy")
         outcome = process(bag, (0.0, 72.0, 144.0, 216.0, 288.0))
-        print(f"{len(outcome.composites.stamps)} sub-apertures; {outcome.sign}")
-        print(f"target: {outcome.target or 'none'}")
+        result = outcome.result
+        print(f"{len(outcome.composites.stamps)} sub-apertures; {result.sign}")
+        found = f"object of {result.dimensions}" if result.mesh is not None else "no object"
+        refused = f"{len(result.rejected)} views without a shadow"
+        print(f"carving: {found}; {refused}")
         figures = options.figures or options.out
         draw_composites(figures / "airsas_composites.png", outcome)
         draw_sub_apertures(figures / "airsas_sub_apertures.png", outcome)
