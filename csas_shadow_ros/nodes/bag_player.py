@@ -97,17 +97,18 @@ class BagPlayerNode(CsasNode):
         rate = self.parameters.rate
         if rate <= 0 or self.views is None:
             return True
-        now, when = time.monotonic(), self.views.times[stamp]
         if self._began is None:
-            self._began = (now, when)
+            return True
         since, first = self._began
-        return (when - first) / 1e9 <= (now - since) * rate
+        return (self.views.times[stamp] - first) / 1e9 <= (time.monotonic() - since) * rate
 
     def send_view(self, stamp: int) -> None:
         """Publish a view as it was recorded."""
         if self.views is None:
             raise BagError(f"view {stamp} ns was asked for, but the bag's image is played")
         image, info = self.views.get(stamp)
+        if self._began is None:
+            self._began = (time.monotonic(), self.views.times[stamp])
         self.source.info.publish(info)
         self.source.image.publish(image)
 

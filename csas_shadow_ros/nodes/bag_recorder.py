@@ -23,7 +23,11 @@ _FLOWING = (*VIEW_STREAMS, "sector")
 #: Latched when they were published, and so when they are played.
 _LATCHED = frozenset(
     {"image", "camera_info", "track", "target", "voxels", "mesh"}
-    | {t for s in ("multilook", "color_by_aspect", "voxel_grid", "voxel_views") for t in (f"{s}/image", f"{s}/camera_info")}
+    | {
+        topic
+        for stream in ("multilook", "color_by_aspect", "voxel_grid", "voxel_views")
+        for topic in (STREAMS[stream].image_topic, STREAMS[stream].info_topic)
+    }
 )
 #: Topics of messages that differ though they carry the same stamp.
 _NEVER_ALIKE = frozenset({"progress", "/diagnostics"})

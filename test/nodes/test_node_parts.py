@@ -1,0 +1,382 @@
+"""Parts of the nodes: parameters, slow and absent consumers, rubbish on the wire, playing and launching."""
+
+from __future__ import annotations
+
+import ast
+import json
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from conftest import Graph
+
+from csas_shadow_ros.bags import BagReader
+from csas_shadow_ros.core.errors import BagError, ParameterError
+from csas_shadow_ros.core.pipeline import ProcessedView, Result
+from csas_shadow_ros.nodes import params, qos
+from csas_shadow_ros.nodes.bag_player import BagPlayerNode
+from csas_shadow_ros.nodes.base import INTEGRATED, CsasNode, Inlet, Source, spin
+from csas_shadow_ros.nodes.composites import CompositesNode
+from csas_shadow_ros.nodes.playing import BagViews, header_stamp, stage_of_bag
+from csas_shadow_ros.nodes.shadow_likelihood import ShadowLikelihoodNode
+from csas_shadow_ros.nodes.sub_aperture import SubApertureNode
+from csas_shadow_ros.nodes.voxel_carver import VoxelCarverNode
+from msg_adapters import RclpyMessages
+
+ROOT = Path(__file__).resolve().parents[2]
+NODES = {
+    n.name: n
+    for n in (SubApertureNode, ShadowLikelihoodNode, VoxelCarverNode, CompositesNode, BagPlayerNode)
+}
+
+
+# Parameters
+
+
+def test_the_yaml_file_is_what_the_dataclasses_say() -> None:
+    text = (ROOT / "config" / "csas_shadow.yaml").read_text(encoding="utf-8")
+    assert text == params.yaml_text(), "run: python -m csas_shadow_ros.nodes.params --yaml > config/…"
+
+
+def test_the_yaml_file_reads_back_to_the_defaults() -> None:
+    document = yaml.safe_load((ROOT / "config" / "csas_shadow.yaml").read_text(encoding="utf-8"))
+    assert {k.removeprefix("/**/") for k in document} == set(params.NODES)
+    for key, section in document.items():
+        kind = params.NODES[key.removeprefix("/**/")]
+        assert kind.from_mapping(section["ros__parameters"]) == kind()
+
+
+def test_the_readme_holds_the_table_of_the_dataclasses() -> None:
+    readme = ROOT / "README.md"
+    text = readme.read_text(encoding="utf-8") if readme.exists() else ""
+    begin, end = "<!-- parameters:begin -->", "<!-- parameters:end -->"
+    if begin not in text:
+        pytest.skip("README.md has no parameter table")
+    table = text.split(begin, 1)[1].split(end, 1)[0]
+    assert table.strip() == params.parameter_table().strip(), "run: python -m csas_shadow_ros.nodes.params"
+
+
+def test_the_table_names_every_parameter_of_every_node_with_its_default() -> None:
+    table = params.parameter_table()
+    for name, kind in params.NODES.items():
+        section = table.split(f"**{name}**", 1)[1].split("\n**", 1)[0]
+        for field in fields(kind):
+            row = next(line for line in section.splitlines() if line.startswith(f"| `{field.name}` |"))
+            assert field.metadata["doc"] in row
+            assert params.expected_of(field) in row
+
+
+@pytest.mark.parametrize("name", list(NODES))
+def test_descriptors_say_the_bounds_of_the_dataclasses(graph: Graph, name: str) -> None:
+    node = NODES[name](context=graph.context)
+    try:
+        for field in fields(params.NODES[name]):
+            descriptor = node.describe_parameter(field.name)
+            meta = field.metadata
+            assert meta["doc"] in descriptor.description
+            assert descriptor.read_only == (field.name not in params.DYNAMIC)
+            ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
+            is_number = isinstance(field.default, int | float) and not isinstance(field.default, bool)
+            assert bool(ranges) == is_number
+            if ranges:
+                assert (ranges[0].from_value, ranges[0].to_value) == (meta["low"], meta["high"])
+    finally:
+        node.destroy_node()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"voxel_size_m": 0.0}, r"voxel_size_m is 0.0 m; expected a number in \[0.0001, 1000\] m"),
+        ({"voxel_size_m": float("nan")}, "voxel_size_m is nan"),
+        ({"method": "medium"}, "method is 'medium'; expected one of"),
+        ({"publish_hz": "often"}, "publish_hz is 'often'; expected a number"),
+        ({"position_m": [1.0]}, r"position_m is \[1.0\]; expected 2 numbers"),
+        ({"voxel_sise_m": 0.1}, "unknown parameter 'voxel_sise_m'"),
+    ],
+)
+def test_a_parameter_that_is_out_of_range_or_unknown_is_refused_at_start(
+    graph: Graph, overrides: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ParameterError, match=message):
+        VoxelCarverNode(context=graph.context, overrides=overrides)
+
+
+def test_whole_numbers_are_taken_where_numbers_are_expected(graph: Graph) -> None:
+    node = VoxelCarverNode(context=graph.context, overrides={"voxel_size_m": 1, "position_m": [1, 2]})
+    assert node.get_parameter("voxel_size_m").value == 1.0
+    assert node.parameters.position_m == (1.0, 2.0)
+    node.destroy_node()
+
+
+def test_setting_a_parameter_out_of_range_is_refused_and_in_range_takes_effect(graph: Graph) -> None:
+    from rclpy.parameter import Parameter
+
+    node = graph.add(BagPlayerNodeOfNothing)
+    refused = node.set_parameters([Parameter("window", value=99)])[0]
+    assert not refused.successful
+    assert "window" in refused.reason
+    assert node.parameters.window == 4
+    assert node.set_parameters([Parameter("window", value=2)])[0].successful
+    assert node.source.flow.window == 2
+    frozen = node.set_parameters([Parameter("bag", value="other")])[0]
+    assert not frozen.successful, "a read-only parameter cannot change in mid-run"
+
+
+def test_a_given_target_needs_its_size(graph: Graph) -> None:
+    node = VoxelCarverNode(context=graph.context, overrides={"target": "given"})
+    try:
+        assert not node.start()
+        assert "size_m is [0.0, 0.0, 0.0]" in node.error
+    finally:
+        node.destroy_node()
+
+
+# Sources and sinks of large messages
+
+
+class BagPlayerNodeOfNothing(CsasNode):
+    """A source of large made-up views."""
+
+    name = "bag_player"
+    count, pixels = 100, np.zeros(1, np.float32)
+
+    def setup(self) -> None:
+        self.pixels = np.full((512, 512), 0.5, np.float32)
+        self.source = Source(self, "shadow", self.send)
+        self.source.flow.offer(range(1, self.count + 1))
+        self.most = 0
+
+    def send(self, stamp: int) -> None:
+        from msg_adapters.messages import make_header
+
+        self.most = max(self.most, self.source.flow.in_flight)
+        header = make_header(self.messages, stamp)
+        octets = self.messages.octets(self.pixels)
+        image = self.messages.make(
+            "sensor_msgs/msg/Image",
+            header=header,
+            height=512,
+            width=512,
+            encoding="32FC1",
+            step=2048,
+            data=octets,
+        )
+        self.source.info.publish(self.messages.make("sensor_msgs/msg/CameraInfo", header=header))
+        self.source.image.publish(image)
+
+
+class SlowSink(CsasNode):
+    """A sink that takes its time."""
+
+    name = "composites"
+    pause_s = 0.02
+
+    def setup(self) -> None:
+        self.received: list[int] = []
+        self.inlet = Inlet(self, "shadow", "sink", self.work)
+
+    def work(self, image: Any, info: Any) -> str:
+        time.sleep(self.pause_s)  # the work of a slow consumer
+        self.received.append(image.header.stamp.nanosec)
+        return INTEGRATED
+
+
+def test_a_slow_sink_gets_every_large_view_and_few_are_ever_on_their_way(graph: Graph) -> None:
+    sink = graph.add(SlowSink)
+    source = graph.add(BagPlayerNodeOfNothing)
+    graph.spin_until(lambda: source.source.flow.finished)
+    assert sorted(set(sink.received)) == list(range(1, 101))
+    assert source.most <= 4
+    assert source.source.flow.resends == 0
+    assert source.counts["sent"] == 100
+
+
+def test_without_any_consumer_the_source_ends_and_one_that_comes_late_gets_everything(graph: Graph) -> None:
+    source = graph.add(BagPlayerNodeOfNothing, sink_wait_s=0.3)
+    graph.spin_until(lambda: source.source.flow.finished)
+    assert source.counts["sent"] == 0
+    sink = graph.add(SlowSink)
+    graph.spin_until(lambda: len(set(sink.received)) == 100)
+
+
+def test_a_subscriber_that_reports_nothing_gets_every_view(graph: Graph) -> None:
+    got: list[int] = []
+    viewer = graph.plain_node("viewer")
+    viewer.create_subscription(
+        RclpyMessages().cls("sensor_msgs/msg/Image"),
+        "shadow/image",
+        lambda m: got.append(m.header.stamp.nanosec),
+        qos.VIEWS,
+    )
+    source = graph.add(BagPlayerNodeOfNothing)
+    graph.spin_until(lambda: source.source.flow.finished)
+    graph.spin_until(lambda: len(got) == 100)
+    assert got == list(range(1, 101))
+
+
+def test_an_outside_consumer_joins_by_reporting_as_the_documentation_shows(graph: Graph) -> None:
+    text = (ROOT / "docs" / "flow_control.md").read_text(encoding="utf-8")
+    code = text.split("```python\n", 1)[1].split("```", 1)[0]
+    node = graph.plain_node("classifier")
+    got: list[int] = []
+    names: dict[str, Any] = {"node": node}
+    exec(compile(code, "docs/flow_control.md", "exec"), names)
+    source = graph.add(BagPlayerNodeOfNothing)
+    waiting: list[Any] = []
+
+    def take(msg: Any) -> None:
+        got.append(msg.header.stamp.nanosec)
+        waiting.append(msg)
+
+    node.create_subscription(RclpyMessages().cls("sensor_msgs/msg/Image"), "shadow/image", take, qos.VIEWS)
+    graph.spin_until(lambda: len(source.source.flow.live()) == 1 or len(got) >= 4, timeout_s=10.0)
+    deadline = time.monotonic() + 30.0
+    while len(set(got)) < 100:
+        assert time.monotonic() < deadline
+        while waiting:
+            names["report"](waiting.pop(0))
+        graph.executor.spin_once(timeout_sec=0.05)
+    assert sorted(set(got)) == list(range(1, 101))
+    assert source.most <= 4
+
+
+def test_rubbish_on_the_wire_does_not_end_a_node(graph: Graph) -> None:
+    """Bytes that are no message of the type: taking them fails inside the executor."""
+    sink = SlowSink(context=graph.context)
+    assert sink.start()
+    stop = threading.Event()
+    thread = threading.Thread(target=spin, args=(sink, stop))
+    thread.start()
+    try:
+        outside = graph.plain_node("outside")
+        publisher = outside.create_publisher(
+            RclpyMessages().cls("sensor_msgs/msg/Image"), "shadow/image", qos.VIEWS
+        )
+        graph.spin_until(lambda: publisher.get_subscription_count() > 0)
+        publisher.publish(b"\x00\x01\x00\x00" + b"\xff" * 40)
+        source = graph.add(BagPlayerNodeOfNothing)
+        graph.spin_until(lambda: source.source.flow.finished)
+        assert sorted(set(sink.received)) == list(range(1, 101))
+        assert thread.is_alive()
+    finally:
+        stop.set()
+        thread.join()
+        sink.stop()
+        sink.destroy_node()
+
+
+# Playing
+
+
+def test_a_pair_of_a_bag_can_be_had_again_in_any_order(view_bag: Callable[[str], Path]) -> None:
+    views = BagViews(BagReader(view_bag("likelihood")), "likelihood")
+    stamps = list(views.times)
+    assert len(stamps) == 36
+    order = [*stamps, stamps[3], stamps[35], stamps[0], *stamps[:5]]
+    for stamp in order:
+        image, info = views.get(stamp)
+        assert header_stamp(image, "image") == header_stamp(info, "info") == stamp
+    assert len(views._recent) <= 16
+    with pytest.raises(BagError, match="holds no image stamped 12345 ns"):
+        views.get(12345)
+
+
+def test_the_stage_of_a_bag_is_the_earliest_that_it_holds_whole(
+    run_bag: Path, view_bag: Callable[[str], Path]
+) -> None:
+    assert stage_of_bag(BagReader(run_bag)) == "image"
+    assert stage_of_bag(BagReader(view_bag("shadow"))) == "shadow"
+    with pytest.raises(BagError, match="holds no likelihood; it holds: image"):
+        stage_of_bag(BagReader(run_bag), "likelihood")
+
+
+@pytest.mark.parametrize(
+    "cdr", [b"", b"\x00\x01\x00\x00abc", b"\x07" * 20, b"\x00\x01\x00\x00" + b"\xff" * 8]
+)
+def test_a_message_without_a_legible_stamp_is_refused(cdr: bytes) -> None:
+    with pytest.raises(BagError, match="x: "):
+        header_stamp(cdr, "x")
+
+
+def test_a_player_keeps_to_the_rate(
+    graph: Graph, view_bag: Callable[[str], Path], reference: tuple[Result, list[ProcessedView]]
+) -> None:
+    stamps = [v.likelihood.info.stamp_ns for v in reference[1]]
+    recorded_s = (max(stamps) - min(stamps)) / 1e9
+    got: list[float] = []
+    viewer = graph.plain_node("viewer")
+    viewer.create_subscription(
+        RclpyMessages().cls("sensor_msgs/msg/Image"),
+        "likelihood/image",
+        lambda m: got.append(time.monotonic()),
+        qos.VIEWS,
+    )
+    graph.add(BagPlayerNode, bag=str(view_bag("likelihood")), rate=recorded_s / 2.0)  # in two seconds
+    graph.spin_until(lambda: len(got) == 36)
+    assert 1.6 < got[-1] - got[0] < 6.0
+
+
+@pytest.mark.parametrize(("bag", "message"), [("", "bag is ''"), ("/nowhere", "there is no bag at /nowhere")])
+def test_a_player_without_a_bag_refuses_to_start(graph: Graph, bag: str, message: str) -> None:
+    node = BagPlayerNode(context=graph.context, overrides={"bag": bag})
+    try:
+        assert not node.start()
+        assert message in node.error
+    finally:
+        node.destroy_node()
+
+
+def test_diagnostics_say_how_far_each_node_is_and_what_it_waits_for(graph: Graph) -> None:
+    got: dict[str, Any] = {}
+    viewer = graph.plain_node("viewer")
+    viewer.create_subscription(
+        RclpyMessages().cls("diagnostic_msgs/msg/DiagnosticArray"),
+        "/diagnostics",
+        lambda m: got.__setitem__(m.status[0].name, m.status[0]),
+        qos.DIAGNOSTICS,
+    )
+    graph.add(SubApertureNode)
+    graph.spin_until(lambda: "/csas/sub_aperture" in got)
+    status = got["/csas/sub_aperture"]
+    assert status.message == "waiting for image and track"
+    keys = {v.key for v in status.values}
+    assert {"busy seconds", "sectors", "sub_aperture total"} <= keys
+
+
+# Files that other tools read
+
+
+def test_the_launch_file_compiles_and_starts_every_node() -> None:
+    source = (ROOT / "launch" / "csas_shadow.launch.py").read_text(encoding="utf-8")
+    tree = ast.parse(source)
+    assert any(isinstance(n, ast.FunctionDef) and n.name == "generate_launch_description" for n in tree.body)
+    for name in params.NODES:
+        assert f'"{name}"' in source
+
+
+def test_the_layouts_show_topics_of_the_contract() -> None:
+    from msg_adapters import TOPICS
+
+    known = {t if t.startswith("/") else f"/csas/{t}" for t in TOPICS}
+    rviz = yaml.safe_load((ROOT / "config" / "csas_shadow.rviz").read_text(encoding="utf-8"))
+    shown = [d["Topic"]["Value"] for d in rviz["Visualization Manager"]["Displays"] if "Topic" in d]
+    assert len(shown) >= 4
+    assert set(shown) <= known
+    layout = json.loads((ROOT / "config" / "foxglove_layout.json").read_text(encoding="utf-8"))
+    panels = set(layout["configById"])
+
+    def leaves(node: Any) -> list[str]:
+        return [node] if isinstance(node, str) else leaves(node["first"]) + leaves(node["second"])
+
+    assert set(leaves(layout["layout"])) == panels
+    text = json.dumps(layout["configById"])
+    for topic in ("/csas/mesh", "/csas/voxels", "/csas/shadow/image"):
+        assert topic in text
+        assert topic in known

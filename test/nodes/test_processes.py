@@ -1,0 +1,246 @@
+"""The graph as real processes: killed with SIGKILL, ended with SIGINT, refusing what they cannot do."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import PARAMETERS, STEP_DEG
+
+from csas_shadow_ros import replay as module
+from csas_shadow_ros.bags import read_run, write_run
+from csas_shadow_ros.core.errors import BagError, NoTargetError, ParameterError, SpectrumSignError
+from csas_shadow_ros.core.parameters import PipelineParameters
+from csas_shadow_ros.core.pipeline import ProcessedView, Result
+from csas_shadow_ros.replay import Graph, ReplayError, free_domain_id, graph_environment, replay
+from csas_shadow_ros.simulation import SimulatedRun
+
+Reference = tuple[Result, list[ProcessedView]]
+
+
+def assert_same_grid(result: module.ReplayResult, reference: Reference) -> None:
+    """Compare with the in-process pipeline, bit for bit."""
+    expected = reference[0].grid
+    assert result.grid is not None
+    assert expected is not None
+    np.testing.assert_array_equal(result.grid.likelihood, expected.likelihood)
+    np.testing.assert_array_equal(result.grid.occupied, expected.occupied)
+    assert result.grid.threshold == expected.threshold
+    assert result.views_used == reference[0].views_used
+
+
+def alive(pid: int) -> bool:
+    """Say whether a process runs (a zombie does not)."""
+    try:
+        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except FileNotFoundError:
+        return False
+
+
+def test_every_process_killed_once_in_mid_run_and_the_grid_and_the_recording_are_the_same(
+    run_bag: Path, reference: Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order = ["shadow_enhancement", "voxel_carver", "sub_aperture", "shadow_likelihood"]
+    order += ["bag_recorder", "bag_player"]
+    graphs: list[Graph] = []
+    pids: list[int] = []
+    victims: list[str] = []
+
+    class Watched(Graph):
+        def __enter__(self) -> Graph:
+            graphs.append(self)
+            return super().__enter__()
+
+    monkeypatch.setattr(module, "Graph", Watched)
+
+    def kill_as_it_goes(done: int, total: int) -> None:
+        # One every few views; the recorder and the player too.
+        if len(victims) < len(order) and done >= 3 + 4 * len(victims) and done < total:
+            process = graphs[0].processes[order[len(victims)]]
+            victims.append(process.node)
+            pids.append(process.pid)
+            os.kill(process.pid, signal.SIGKILL)
+
+    deaths: list[str] = []
+    result = replay(
+        run_bag,
+        tmp_path,
+        PARAMETERS,
+        record=True,
+        composites=False,
+        progress=kill_as_it_goes,
+        notice=deaths.append,
+    )
+    assert len(victims) >= 3, f"the run was over before more could be killed: {victims}"
+    assert len(deaths) == len(victims)
+    assert all(f"{name} was killed by signal 9" in line for name, line in zip(victims, deaths, strict=True))
+    assert_same_grid(result, reference)
+    assert result.lost == 0
+    assert {name: result.nodes[name].restarts for name in victims if name in result.nodes} == {
+        name: 1 for name in victims if name in result.nodes
+    }
+    run = read_run(tmp_path / "recording")
+    for stream in ("sub_aperture", "shadow", "likelihood", "shadow_mask"):
+        assert run.counts[stream] == result.views_total, stream
+    pids += [p.pid for p in graphs[0].processes.values()]
+    assert not [pid for pid in pids if alive(pid)], "no process is left"
+
+
+def test_a_replay_reports_refused_views_with_their_aspect_and_what_each_node_did(
+    simulated: SimulatedRun, tmp_path: Path
+) -> None:
+    from csas_shadow_ros.core.geometry import Track
+
+    track = simulated.track
+    keep = np.degrees(track.aspects_rad) % 360.0
+    keep = (keep < 100.0) | (keep > 140.0)
+    gap = Track(track.stamps_ns[keep], track.positions_m[keep])
+    bag = write_run(tmp_path / "gap", simulated.image, gap)
+    seen: list[tuple[int, int]] = []
+    result = replay(bag, tmp_path / "out", PARAMETERS, progress=lambda d, t: seen.append((d, t)))
+    refused = sorted(r.aspect_deg for r in result.rejected if r.node == "sub_aperture")
+    assert refused
+    assert all(95.0 <= a <= 145.0 for a in refused), refused
+    assert all("track gap" in r.reason for r in result.rejected if r.node == "sub_aperture")
+    assert result.views_total == 360.0 / STEP_DEG - len(refused)
+    assert result.grid is not None
+    assert result.mesh is not None
+    assert result.dimensions is not None
+    assert result.composites["color_by_aspect"].dtype == np.uint8
+    assert result.nodes["voxel_carver"].busy_s > 0
+    assert seen[-1] == (result.views_total, result.views_total)
+
+
+@pytest.mark.parametrize(
+    ("bag", "parameters", "error", "message"),
+    [
+        ("nowhere", {}, BagError, "there is no bag at"),
+        ("run_bag", {"overrides": {"voxel_carver": {"voxel_size_m": -1.0}}}, ParameterError, "voxel_carver"),
+        ("run_bag", {"overrides": {"voxel_craver": {}}}, ParameterError, "unknown node 'voxel_craver'"),
+        ("run_bag", {"stage": "likelihood"}, BagError, "holds no likelihood"),
+        ("likelihood", {"parameters": PipelineParameters()}, ParameterError, "method is"),
+        ("shadow_mask", {}, NoTargetError, "do not tell how large the target is"),
+    ],
+)
+def test_what_cannot_be_replayed_is_refused_before_any_process_starts(
+    request: pytest.FixtureRequest,
+    view_bag: Callable[[str], Path],
+    monkeypatch: pytest.MonkeyPatch,
+    bag: str,
+    parameters: dict[str, Any],
+    error: type[Exception],
+    message: str,
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a process was started")
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    path = {"nowhere": Path("/nowhere")}.get(bag) or (
+        request.getfixturevalue("run_bag") if bag == "run_bag" else view_bag(bag)
+    )
+    with pytest.raises(error, match=message):
+        replay(path, progress=False, **parameters)
+
+
+def test_an_error_of_a_node_is_raised_as_the_pipeline_raises_it_and_no_process_is_left(
+    simulated: SimulatedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dataclasses import replace
+
+    graphs: list[Graph] = []
+    enter = Graph.__enter__
+    monkeypatch.setattr(Graph, "__enter__", lambda self: graphs.append(self) or enter(self))
+    image = replace(simulated.image, acoustics=replace(simulated.image.acoustics, spectrum_sign=-1))
+    bag = write_run(tmp_path / "wrong", image, simulated.track)
+    with pytest.raises(SpectrumSignError, match="shadows fall towards the sonar"):
+        replay(bag, tmp_path / "out", PARAMETERS, progress=False)
+    assert not [p.pid for p in graphs[0].processes.values() if alive(p.pid)]
+
+
+def run_node(name: str, *arguments: str, log_dir: Path, domain: int) -> subprocess.Popen[str]:
+    environment = {k: v for k, v in graph_environment(domain, log_dir).items() if k != "CSAS_PARENT_PID"}
+    return subprocess.Popen(
+        [sys.executable, "-m", f"csas_shadow_ros.nodes.{name}", "--ros-args", *arguments],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("voxel_size_m:=0.0", "voxel_carver: voxel_size_m is 0.0 m; expected a number in [0.0001, 1000] m"),
+        ("voxelsize:=1.0", "voxel_carver: unknown parameter 'voxelsize'; expected one of: "),
+        ("target:=given", "voxel_carver: size_m is [0.0, 0.0, 0.0]; expected x, y, z > 0 m with a given"),
+    ],
+)
+def test_a_node_ends_with_status_2_and_one_clear_line_where_a_parameter_is_wrong(
+    tmp_path: Path, argument: str, message: str
+) -> None:
+    process = run_node("voxel_carver", "-p", argument, log_dir=tmp_path, domain=free_domain_id())
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert stderr.strip().splitlines()[-1].startswith(message)
+    assert "Traceback" not in stderr
+
+
+def test_a_recorder_that_is_interrupted_finishes_its_bag(tmp_path: Path) -> None:
+    out = tmp_path / "recording"
+    process = run_node("bag_recorder", "-p", f"out:={out}", log_dir=tmp_path, domain=free_domain_id())
+    deadline = time.monotonic() + 60
+    while not list(out.glob("*.mcap")):
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.05)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=30)
+    assert process.returncode == 0, stderr
+    assert (out / "metadata.yaml").exists()
+
+
+def test_nodes_end_when_the_process_that_started_them_was_killed(tmp_path: Path) -> None:
+    code = (
+        "import sys, time; from pathlib import Path\n"
+        "from csas_shadow_ros.replay import Graph, free_domain_id\n"
+        f"g = Graph({{'composites': {{}}}}, free_domain_id(), Path({str(tmp_path)!r}))\n"
+        "g.__enter__(); print(g.processes['composites'].pid, flush=True); time.sleep(600)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(module.__file__).parents[1])}
+    command = [sys.executable, "-c", code]
+    parent = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    parent.kill()
+    parent.communicate()
+    deadline = time.monotonic() + 30
+    while alive(pid):
+        assert time.monotonic() < deadline, "the node outlives its parent"
+        time.sleep(0.1)
+
+
+def test_a_node_that_dies_again_and_again_ends_the_replay_by_name(tmp_path: Path) -> None:
+    graph = Graph({"composites": {}}, free_domain_id(), tmp_path, max_restarts=1)
+    with graph:
+        process = graph.processes["composites"]
+        for _ in range(2):
+            os.kill(process.pid, signal.SIGKILL)
+            deadline = time.monotonic() + 10
+            while process.poll() is None:
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
+            if process.restarts < 1:
+                graph.watch()
+        with pytest.raises(ReplayError, match="composites died 2 times; composites was killed by signal 9"):
+            graph.watch()
+    assert not alive(process.pid)
