@@ -170,6 +170,9 @@ def main(argv: list[str] | None = None) -> int:
         outcome = process(bag, (0.0, 72.0, 144.0, 216.0, 288.0))
         result = outcome.result
         print(f"{len(outcome.composites.stamps)} sub-apertures; {result.sign}")
+        if result.sign is not None:
+            stated, other = result.sign.stated_evidence, result.sign.other_evidence
+            print(f"evidence of a body: {stated:.1e} m⁴ as stated, {other:.1e} m⁴ with the other sign")
         found = f"object of {result.dimensions}" if result.mesh is not None else "no object"
         refused = f"{len(result.rejected)} views without a shadow"
         print(f"carving: {found}; {refused}")
