@@ -73,10 +73,22 @@ class Spectrum:
             The image.
         workers : int
             Threads.
+
+        Raises
+        ------
+        ParameterError
+            If a pixel is not finite.
         """
         shape = tuple(scipy.fft.next_fast_len(n) for n in image.grid.shape)
         pixels = np.asarray(image.pixels, dtype=np.complex64)
         values = scipy.fft.fft2(pixels, s=shape, norm="forward", workers=workers)
+        # One pixel that is not finite spoils every bin: the zeroth one tells.
+        if not np.isfinite(values[0, 0]):
+            bad = np.argwhere(~np.isfinite(pixels))
+            where = f"pixel (row {bad[0, 0]}, col {bad[0, 1]})" if len(bad) else "the sum of its pixels"
+            raise ParameterError(
+                f"the image holds {len(bad)} pixels that are not finite, first {where}; expected finite numbers"
+            )
         return cls(values, image.grid)
 
     @property

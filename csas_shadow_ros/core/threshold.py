@@ -16,8 +16,9 @@ _SOFT_LEVEL = 0.115
 _CONSENSUS = 0.02
 #: Hard: any contradiction removes; the least one, 1 of 65535 views, is above this.
 _HARD = 1e-5
-#: A voxel under the object is part of it unless its likelihood is over this.
-_SUPPORT = {"soft": 0.35, "consensus": 0.08, "hard": 0.08}
+#: Soft: a voxel under the object is part of it unless its likelihood is over this. Masks say "unknown"
+#: where the target's echo lies, so that for them only unknown voxels need filling.
+_SOFT_SUPPORT = 0.35
 #: No object: the darkest voxels are brighter than this fraction of the brightest.
 _NO_OBJECT = 0.5
 #: How many voxels "the darkest" are.
@@ -93,7 +94,7 @@ def occupied_voxels(likelihood: NDArray[np.float32], threshold: float, method: s
         return np.zeros(likelihood.shape, bool)
     with np.errstate(invalid="ignore"):
         dark = likelihood < threshold
-    body = supported(dark, likelihood, max(_SUPPORT[method], threshold))
+    body = supported(dark, likelihood, max(_SOFT_SUPPORT, threshold) if method == "soft" else threshold)
     labels, count = scipy.ndimage.label(body, np.ones((3, 3, 3), bool))
     if count < 2:
         return body

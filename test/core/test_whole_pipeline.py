@@ -12,8 +12,8 @@ from core_data import circle_track, ground_of_pixels, hidden_by_box, iou
 
 from csas_shadow_ros.core import pipeline
 from csas_shadow_ros.core.carving import Carver
-from csas_shadow_ros.core.errors import NoTargetError, SpectrumSignError, ViewError
-from csas_shadow_ros.core.geometry import Track, View
+from csas_shadow_ros.core.errors import NoTargetError, ParameterError, SpectrumSignError, ViewError
+from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, Track, View
 from csas_shadow_ros.core.likelihood import outside_likelihood, view_levels
 from csas_shadow_ros.core.parameters import (
     CarvingParameters,
@@ -23,7 +23,7 @@ from csas_shadow_ros.core.parameters import (
 )
 from csas_shadow_ros.core.segmentation import require_silhouette, segment_shadow
 from csas_shadow_ros.core.shadow import enhance
-from csas_shadow_ros.core.subaperture import SubApertures
+from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.core.target import find_target, search_views, spectrum_sign_evidence
 from csas_shadow_ros.core.volume import Volume
 from csas_shadow_ros.simulation import simulate
@@ -301,3 +301,13 @@ def test_views_are_given_on_with_all_their_stages(box_result):
         assert len(set(infos)) == 1
         assert isinstance(view.mask, View)
     assert cv2.countNonZero((seen[0].mask.pixels == 255).astype(np.uint8)) > 0
+
+
+def test_an_image_with_a_pixel_that_is_not_finite_is_refused_by_its_place():
+    rng = np.random.default_rng(0)
+    pixels = (rng.standard_normal((64, 64)) + 1j * rng.standard_normal((64, 64))).astype(np.complex64)
+    pixels[3, 7] = np.nan
+    grid = GroundGrid.centred(64, 64, 0.005)
+    image = CoherentImage(pixels, grid, Acoustics(60e3, 20e3, 1500.0, 1))
+    with pytest.raises(ParameterError, match=r"1 pixels that are not finite, first pixel \(row 3, col 7\)"):
+        Spectrum.of_image(image)
