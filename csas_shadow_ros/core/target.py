@@ -39,6 +39,8 @@ _SEARCH_VOXELS = 110
 _DARK = 0.4
 #: The smallest body that the search reports, in search voxels.
 _MIN_VOXELS = 12
+#: The darkest voxels of a body, as many as that, are dark on the mean: a body's core is shadow from all sides.
+_CORE = 0.28
 #: Margin round the body in the carved volume: a share of its size, and at least this many search voxels.
 _MARGIN_SHARE, _MARGIN_VOXELS = 0.25, 5
 #: The other sign must explain this many times more body than the stated one to be called the right one.
@@ -141,6 +143,8 @@ def _bodies(likelihood: NDArray[np.float32], volume: Volume) -> list[Target]:
         body = labels[box] == label
         layers = np.flatnonzero(body.any(axis=(1, 2)))
         if int(body.sum()) < _MIN_VOXELS or len(layers) < 2:
+            continue
+        if np.sort(likelihood[box][body])[:_MIN_VOXELS].mean() > _CORE:
             continue
         z = volume.z_m[box[0]]
         evidence = float((body.sum(axis=(1, 2)) * z).sum()) * d**3
