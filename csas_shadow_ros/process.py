@@ -145,8 +145,8 @@ def replay_bag(
         import rclpy  # noqa: F401  (asked for here, to say so in one line)
     except ImportError as error:
         raise CsasError(
-            f"replay needs ROS 2, which is not there ({error}); source it or pip install 'csas_shadow_ros[ros]',"
-            " or use `csas-shadow run`"
+            f"replay needs ROS 2, which is not there ({error}); source it, or pip install"
+            " 'csas_shadow_ros[ros]', or use `csas-shadow run`"
         ) from error
     from .replay import replay
 

@@ -17,7 +17,7 @@ import matplotlib as mpl
 import numpy as np
 import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import hsv_to_rgb
+from matplotlib.colors import ListedColormap, hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
@@ -279,7 +279,7 @@ def figure_1c(subject: Subject) -> Figure:
     angle = np.linspace(0.0, TWO_PI, 361)
     colours = np.stack([angle[:-1] / TWO_PI, np.ones(360), np.ones(360)], axis=-1)
     rgb = hsv_to_rgb(colours)
-    wheel.bar(angle[:-1], 0.4, width=TWO_PI / 360, bottom=0.6, color=rgb, edgecolor=rgb, align="edge")
+    wheel.pcolormesh(angle, [0.6, 1.0], np.arange(360)[None, :], cmap=ListedColormap(rgb), shading="flat")
     wheel.set_ylim(0, 1)
     wheel.set_yticks([])
     wheel.grid(False)

@@ -56,8 +56,8 @@ class RecordedComposites:
 def adopt_replay(writer: ResultsWriter, replayed: ReplayResult, parameters: PipelineParameters) -> Result:
     """Turn what a replay left, and its recording, into what the in-process pipeline would have left.
 
-    The grid, mesh, target and composites are the graph's own. The other method's grid (figure 8) is carved from
-    the recorded views.
+    The grid, mesh, target and composites are the graph's own. The other method's grid (figure 8) is
+    carved from the recorded views.
 
     Parameters
     ----------
