@@ -462,3 +462,28 @@ def test_a_run_that_breaks_leaves_nothing_behind(tmp_path):
     with pytest.raises(ResultsError, match="no results folder"):
         ResultsWriter(tmp_path / "file", overwrite=True)
     assert not is_results_folder(tmp_path)
+
+
+# -- through the node graph ---------------------------------------------------------------------------
+
+
+def test_replay_leaves_the_folder_that_run_leaves_with_the_same_grid(tiny_box_bag, tmp_path):
+    pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+    step = ("--step-deg", "30", "--quiet")
+    replayed = Said("replay", tiny_box_bag.path, "--out", tmp_path / "graph", *step)
+    assert replayed.code == 0, replayed.err
+    assert run_quickly(tiny_box_bag.path, tmp_path / "process", *step).code == 0
+    with np.load(tmp_path / "graph" / "grid.npz") as a, np.load(tmp_path / "process" / "grid.npz") as b:
+        for name in a.files:
+            assert np.array_equal(a[name], b[name], equal_nan=True), name
+    report = read_report(tmp_path / "graph")
+    assert report["through"] == "node graph"
+    assert (report["views"]["in"], report["views"]["used"], report["views"]["lost"]) == (12, 12, 0)
+    assert len(report["levels"]["by_view"]) == 12
+    assert report["truth"]["scores"]["iou_truth"] > 0.3
+    assert report["figures_left_out"] == {}
+    counts = read_run(tmp_path / "graph" / "result.mcap").counts
+    assert all(counts[s] == 12 for s in ("sub_aperture", "shadow", "likelihood", "shadow_mask"))
+    assert counts["voxel_grid"] == 1
+    assert {"sub_aperture", "voxel_carver"} <= set(report["nodes"])
+    assert (tmp_path / "graph" / "log" / "voxel_carver.log").exists()
