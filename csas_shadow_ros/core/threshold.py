@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 #: Soft: where the threshold lies between the darkest voxels (0) and the brightest (1) of the volume. A
 #: voxel just outside the object is bright in some views only: those that look past the object's side.
 _SOFT_LEVEL = 0.115
-#: Consensus: a voxel is removed when more than this fraction of its views contradict it. A voxel just off
-#: the middle of a flat side (2 cm off a side of 0.8 m) is seen to be free from 3 % of the circle.
-_CONSENSUS = 0.02
+#: Consensus: a voxel is removed when more than this fraction of its views contradict it. A voxel 2 cm off the
+#: middle of a flat side of 0.8 m is seen to be free from 3 % of the circle; less tolerance loses shadows that
+#: cross clutter, more leaves a skirt round flat sides.
+_CONSENSUS = 0.04
 #: Hard: any contradiction removes; the least one, 1 of 65535 views, is above this.
 _HARD = 1e-5
 #: Soft: a voxel under the object is part of it unless its likelihood is over this. Masks say "unknown"

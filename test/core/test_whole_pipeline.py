@@ -311,3 +311,24 @@ def test_an_image_with_a_pixel_that_is_not_finite_is_refused_by_its_place():
     image = CoherentImage(pixels, grid, Acoustics(60e3, 20e3, 1500.0, 1))
     with pytest.raises(ParameterError, match=r"1 pixels that are not finite, first pixel \(row 3, col 7\)"):
         Spectrum.of_image(image)
+
+
+@pytest.mark.parametrize("method", ["consensus", "hard", "soft"])
+def test_shadows_that_leave_the_image_leave_unknown_voxels_and_no_roof(method):
+    height = 0.4
+    run = simulate("tiny", box(0.8, 0.4, height), seed=3)
+    image, first, last = run.image, 16, run.image.grid.rows - 32
+    grid = replace(
+        image.grid, rows=last - first, y_max_m=image.grid.y_max_m - first * image.grid.spacing_m
+    )
+    cut = replace(image, pixels=np.ascontiguousarray(image.pixels[first:last]), grid=grid)
+    parameters = PipelineParameters(
+        sub_aperture=SubApertureParameters(step_deg=10.0), carving=CarvingParameters(method=method)
+    )
+    result = pipeline.run(cut, run.track, parameters)
+    assert result.grid is not None
+    assert result.dimensions is not None
+    volume = result.grid.volume
+    assert volume.size_m[2] > 1.4 * height
+    assert np.isnan(result.grid.likelihood[volume.z_m > 1.4 * height]).any()
+    assert 0.8 * height < result.dimensions.height_m < 1.4 * height
