@@ -51,7 +51,7 @@ install: $(VENV)/.installed ## install the package and ROS 2 into it
 
 demo: install ## replay the demonstration bag
 	@mkdir -p $(ROS_LOG_DIR)
-	$(VENV)/bin/csas-shadow replay $(DEMO_BAG) --out $(DEMO_OUT)
+	$(VENV)/bin/csas-shadow replay $(DEMO_BAG) --out $(DEMO_OUT) --overwrite
 
 test: install lint types unit ## lint, types and all tests
 
