@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import PARAMETERS, STEP_DEG, VOXEL_M, Graph
+
+pytest.importorskip("rclpy")
+
+from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M, Graph
 
 from csas_shadow_ros.bags import read_run, write_run
 from csas_shadow_ros.core.likelihood import outside_likelihood

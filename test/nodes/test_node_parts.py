@@ -14,7 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from conftest import Graph
+
+pytest.importorskip("rclpy")
+
+from graph_of_nodes import Graph
 
 from csas_shadow_ros.bags import BagReader
 from csas_shadow_ros.core.errors import BagError, ParameterError

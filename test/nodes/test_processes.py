@@ -13,7 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import PARAMETERS, STEP_DEG
+
+pytest.importorskip("rclpy")
+
+from graph_of_nodes import PARAMETERS, STEP_DEG
 
 from csas_shadow_ros import replay as module
 from csas_shadow_ros.bags import read_run, write_run
