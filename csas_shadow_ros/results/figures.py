@@ -46,7 +46,7 @@ from ..core.volume import VoxelGrid
 #: Levels shown, dB over the median.
 _DB_LOW, _DB_HIGH = -20.0, 20.0
 #: Aspects of the collections of six, degrees.
-SIX_ASPECTS_DEG = (0.0, 60.0, 120.0, 180.0, 240.0, 300.0)
+SIX_ASPECTS_DEG = (20.0, 80.0, 140.0, 200.0, 260.0, 320.0)
 #: Aperture of figure 5's reduced sub-aperture, as in the paper.
 _REDUCED_DEG = 4.0
 #: More triangles than this are drawn from a coarser surface.
@@ -305,7 +305,7 @@ def figure_2a(subject: Subject) -> Figure:
     top = (spectrum.values.shape[0] // 2) * step_y
     extent = (left, left + cols * step_x, top - rows * step_y, top)
     kept = subject.keeper.of("sub_aperture")
-    aspect = kept[1 if len(kept) > 1 else 0].info.aspect_rad if kept else math.radians(60.0)
+    aspect = kept[0].info.aspect_rad if kept else math.radians(SIX_ASPECTS_DEG[0])
     aperture = math.radians(subject.parameters.sub_aperture.aperture_deg)
     sign = image.acoustics.spectrum_sign
     low, _, high = image.acoustics.ground_band(track.grazing_rad)
@@ -412,6 +412,22 @@ def _example(subject: Subject) -> AnyView:
     return max(views, key=dark)
 
 
+def _most_enhanced(subject: Subject) -> AnyView:
+    """Return the kept view whose segmented shadow enhancement has darkened most."""
+
+    def gain(view: AnyView) -> float:
+        full, shadow, mask = view.sub_aperture, view.shadow, view.mask
+        if full is None or shadow is None or mask is None:
+            return -math.inf
+        inside = (mask.pixels == MASK_SHADOW) & np.isfinite(full.pixels) & np.isfinite(shadow.pixels)
+        if not inside.any():
+            return -math.inf
+        powers = (np.square(np.abs(v.pixels[inside])).mean() for v in (full, shadow))
+        return float(np.divide(*powers))
+
+    return max((v for v in subject.keeper.views()), key=gain, default=_example(subject))
+
+
 def _around_target(subject: Subject, view: View) -> tuple[float, float, float, float]:
     """Return the part of the view frame, about the target (m), in which its shadow lies."""
     target, dimensions = subject.result.target, subject.result.dimensions
@@ -452,7 +468,7 @@ def _show_view(axes: Any, subject: Subject, view: View, pixels: Any, title: str,
 
 def figure_5(subject: Subject) -> Figure:
     """Draw a reduced sub-aperture, the full one and the shadow enhanced one, at one aspect."""
-    example = _example(subject)
+    example = _most_enhanced(subject)
     shadow, full = example.shadow, example.sub_aperture
     image, track, target = subject.image, subject.track, subject.result.target
     if image is None or track is None or shadow is None or full is None or target is None:
