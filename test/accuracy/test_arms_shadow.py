@@ -1,7 +1,8 @@
 """Figure 5 of the paper as a measurement: the thin arms' shadows show with enhancement and not without.
 
 Seen nearly along them, the arms of the frame (8 cm thick, 30 cm above the seabed) cast shadows that are as
-narrow and lie 1.2 to 1.7 m behind the target, where an aperture of 12° blurs them over three times their width.
+narrow and lie 1.2 to 1.7 m behind the target, where an aperture of 12° blurs them to three times their
+width.
 """
 
 from __future__ import annotations
