@@ -87,7 +87,8 @@ class Spectrum:
             bad = np.argwhere(~np.isfinite(pixels))
             where = f"pixel (row {bad[0, 0]}, col {bad[0, 1]})" if len(bad) else "the sum of its pixels"
             raise ParameterError(
-                f"the image holds {len(bad)} pixels that are not finite, first {where}; expected finite numbers"
+                f"the image holds {len(bad)} pixels that are not finite, first {where};"
+                " expected finite numbers"
             )
         return cls(values, image.grid)
 

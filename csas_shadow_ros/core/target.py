@@ -39,7 +39,7 @@ _SEARCH_VOXELS = 110
 _DARK = 0.4
 #: The smallest body that the search reports, in search voxels.
 _MIN_VOXELS = 12
-#: The darkest voxels of a body, as many as that, are dark on the mean: a body's core is shadow from all sides.
+#: The darkest voxels of a body, as many as that, have a mean under this: its core is dark from all sides.
 _CORE = 0.28
 #: Margin round the body in the carved volume: a share of its size, and at least this many search voxels.
 _MARGIN_SHARE, _MARGIN_VOXELS = 0.25, 5
