@@ -12,8 +12,9 @@ from typing import Any
 
 import yaml
 
-from .bags import BagReader, Run, read_run
-from .core.errors import BagError, CsasError, ParameterError
+from .bags import BagReader, Problem, Run, read_run
+from .bags.check import ERROR, judge_amplitude, judge_coverage, judge_image
+from .core.errors import BagError, CsasError, ParameterError, SpectrumSignError
 from .core.geometry import CoherentImage, Track, View
 from .core.parameters import PipelineParameters
 from .core.pipeline import Result
@@ -99,9 +100,9 @@ def process_bag(
             result = _from_views(run, context, writer, workers, progress, notice)
         context.timings_s["write_views"] = writer.view_seconds
         result.timings_s["views"] = max(result.timings_s.get("views", 0.0) - writer.view_seconds, 0.0)
-        context.problems = [str(problem) for problem in run.problems]
-        for problem in context.problems:
-            notice(f"left out: {problem}")
+        context.problems = told_once(run.problems)
+        for line in context.problems:
+            notice(f"problem: {line}")
         context.input = describe_run(run)
         return writer.finish(result, context)
 
@@ -155,6 +156,10 @@ def replay_bag(
         began = time.perf_counter()
         run = read_run(bag)
         context = Context(p, command, truth=read_truth(bag))
+        image = None
+        if choose_start(run, start_from) == "image":
+            image = run.coherent_image()
+            refuse_contradictions(image, run.require_track(), notice)
         context.timings_s["read"] = time.perf_counter() - began
         scratch = writer.work / ".replay"
         replayed = replay(
@@ -170,14 +175,14 @@ def replay_bag(
         )
         context.stage = "image" if replayed.stage == "sector" else replayed.stage
         if context.stage == "image":
-            context.image = run.coherent_image()
+            context.image = image
         context.track = run.track
         context.nodes, context.views_lost = node_table(replayed), replayed.lost
         context.views_in = replayed.views_total
         result = adopt_replay(writer, replayed, p)
         (scratch / "log").rename(writer.work / "log")
         shutil.rmtree(scratch)
-        context.problems = [*(str(problem) for problem in run.problems), *unplaced(replayed)]
+        context.problems = [*told_once(run.problems), *unplaced(replayed)]
         context.input = describe_run(run)
         return writer.finish(result, context)
 
@@ -215,6 +220,7 @@ def _from_image(
 ) -> Result:
     began = time.perf_counter()
     image, track = run.coherent_image(), run.require_track()
+    refuse_contradictions(image, track, notice)
     context.timings_s["read"] += time.perf_counter() - began
     sign = context.spectrum_sign_override
     if sign is not None:
@@ -225,9 +231,22 @@ def _from_image(
     context.image, context.track = image, track
     as_recorded = sign is None and run.image is not None
     writer.write_source(image, track, BagReader(run.path, run.namespace) if as_recorded else None)
-    return run_pipeline(
-        image, track, context.parameters, progress=progress, on_view=writer.add_view, workers=workers
-    )
+    try:
+        result = run_pipeline(
+            image, track, context.parameters, progress=progress, on_view=writer.add_view, workers=workers
+        )
+    except SpectrumSignError as error:
+        raise SpectrumSignError(
+            f"{error}; correct camera_info.d[3], or run with --spectrum-sign"
+            f" {-image.acoustics.spectrum_sign:+d}"
+        ) from error
+    if result.composites is None and result.rejected:
+        # Nothing was looked at: that is no finding that there is no object.
+        raise BagError(
+            f"{run.path}: none of {len(result.rejected)} views could be made:"
+            f" {next(iter(result.rejected.values()))}"
+        )
+    return result
 
 
 def _from_views(
@@ -240,9 +259,19 @@ def _from_views(
         notice(f"spectrum sign of the views overridden: {sign:+d} is used")
     writer.write_source(None, run.track)
 
+    warned: set[str] = set()
+
     def views() -> Iterator[View]:
+        usable = False
         for view in run.views(stage):
+            usable = True
+            for _, problem, remedy in judge_amplitude(view) if stage == "shadow" else ():
+                if not warned:
+                    notice(f"warning: view stamped {view.info.stamp_ns} ns: {problem}. {remedy}")
+                    warned.add(problem)
             yield view if sign is None else with_spectrum_sign(view, sign)
+        if not usable:
+            raise BagError(run.why(f"none of the {run.counts[stage]} {stage} views is usable"))
 
     return run_views(
         views,
@@ -253,6 +282,40 @@ def _from_views(
         on_view=writer.add_view,
         workers=workers,
     )
+
+
+def refuse_contradictions(image: CoherentImage, track: Track, notice: Notice = _ignore) -> None:
+    """Refuse an image, band and track that cannot belong together: "no object" would be a false answer.
+
+    Parameters
+    ----------
+    image : CoherentImage
+        The image, with its band.
+    track : Track
+        The track.
+    notice : callable
+        Called with each doubt that is no reason to refuse.
+
+    Raises
+    ------
+    BagError
+        With what is wrong and what to do about it.
+    """
+    for level, problem, remedy in (*judge_coverage(track), *judge_image(image, track)):
+        if level == ERROR:
+            raise BagError(f"{problem}. {remedy}")
+        notice(f"{level}: {problem}. {remedy}")
+
+
+def told_once(problems: Sequence[Problem]) -> list[str]:
+    """Return problems as lines; what is wrong with many messages alike is one line."""
+    alike: dict[tuple[str, str], list[Problem]] = {}
+    for problem in problems:
+        alike.setdefault((problem.topic, problem.reason), []).append(problem)
+    return [
+        str(same[0]) + (f" ({len(same)} messages alike)" if len(same) > 1 else "")
+        for same in alike.values()
+    ]
 
 
 def describe_image(image: CoherentImage) -> dict[str, Any]:

@@ -37,6 +37,12 @@ BAND_MARGIN = 0.1
 MIN_BAND_ENERGY = 0.5
 #: Less than this is worth a word.
 GOOD_BAND_ENERGY = 0.8
+#: The middle of an image's energy may lie this far from that of the stated band, in band widths.
+MAX_BAND_SHIFT = 0.15
+#: A track that covers less than this leaves no room for a view: 0.75 of an aperture of 12 degrees.
+MIN_COVERAGE_RAD = math.radians(9.0)
+#: More exact zeros than this in an amplitude view are no measurement.
+MAX_ZEROS = 0.01
 #: A view's sonar may be this fraction of its range away from the track at the view's stamp.
 SONAR_TOLERANCE = 0.02
 _MAX_FFT_SIDE = 2048
@@ -115,7 +121,18 @@ class CheckReport:
     def __str__(self) -> str:
         head = f"{self.path}: {'usable' if self.ok else 'not usable as it is'}"
         counts = [f"  {topic}: {n}" for topic, n in sorted(self.topics.items())]
-        return "\n".join([head, *counts, *(str(f) for f in self.findings)])
+        return "\n".join([head, *counts, *self._told_once()])
+
+    def _told_once(self) -> list[str]:
+        """Return the findings as text; what is said of many messages alike, of the first of them."""
+        alike: dict[tuple[str, str, str], list[Finding]] = {}
+        for finding in self.findings:
+            alike.setdefault((finding.level, finding.topic, finding.problem), []).append(finding)
+        texts = []
+        for same in alike.values():
+            more = f" ({len(same)} messages alike)" if len(same) > 1 else ""
+            texts.append(str(dataclasses.replace(same[0], problem=same[0].problem + more)))
+        return texts
 
 
 def check_bag(path: str | Path, namespace: str | None = None) -> CheckReport:
@@ -142,7 +159,10 @@ def check_bag(path: str | Path, namespace: str | None = None) -> CheckReport:
         )
         return report
     _Check(reader, report).run()
-    report.findings.sort(key=lambda f: (ERROR, WARNING, INFO).index(f.level))
+    # Damage comes first: what is missing elsewhere follows from it.
+    report.findings.sort(
+        key=lambda f: ((ERROR, WARNING, INFO).index(f.level), f.problem not in reader.problems)
+    )
     return report
 
 
@@ -168,7 +188,7 @@ class _Check:
         elif "differs from an earlier" in problem.reason:
             remedy = "The stamp identifies a view: give every view a stamp of its own."
         else:
-            remedy = f"Let the publisher of {problem.topic} send what is expected (see the topic contract)."
+            remedy = f"Let the publisher of {problem.topic} send what docs/conventions.md expects."
         self.say(
             ERROR, problem.topic, problem.reason, remedy, number=problem.number, stamp_ns=problem.stamp_ns
         )
@@ -214,16 +234,8 @@ class _Check:
         if self.track is None:
             return
         self.report.usable["track"] = len(self.track)
-        if gaps := self.track.gaps:
-            arcs = ", ".join(str(g) for g in gaps[:8])
-            arcs += f" and {len(gaps) - 8} more" if len(gaps) > 8 else ""
-            covered = math.degrees(self.track.coverage_rad)
-            self.say(
-                WARNING,
-                topic,
-                f"the track covers {covered:.1f} of 360 degrees; missing: {arcs}",
-                "No views are made in these arcs. Record the track round the whole circle if it was flown.",
-            )
+        for level, problem, remedy in judge_coverage(self.track):
+            self.say(level, topic, problem, remedy)
 
     def check_stream(self, stream_name: str) -> None:
         usable = 0
@@ -235,6 +247,17 @@ class _Check:
                 continue
             usable += 1
             place = {"number": pair.number, "stamp_ns": pair.stamp_ns}
+            if stream_name == "image" and usable > 1:
+                self.say(
+                    WARNING,
+                    pair.topic,
+                    "is a second image; only the first is processed",
+                    "One bag holds one run: record each into a bag of its own.",
+                    **place,
+                )
+            if stream_name == "shadow":
+                for level, problem, remedy in judge_amplitude(item):
+                    self.say(level, pair.topic, problem, remedy, **place)
             for level, problem, remedy in self.judge(item):
                 self.say(level, pair.topic, problem, remedy, **place)
         if usable:
@@ -244,9 +267,7 @@ class _Check:
         if self.track is None:
             return
         if isinstance(item, CoherentImage):
-            yield from judge_geometry(item.grid, self.track)
-            yield from judge_band(item.grid, item.acoustics, self.track)
-            yield from judge_energy(item, self.track)
+            yield from judge_image(item, self.track)
             yield from check_spectrum_sign(item, self.track)
         elif isinstance(item, Sector):
             yield from judge_geometry(item.grid, self.track)
@@ -289,6 +310,49 @@ def _read(stream_name: str, image: Any, info: Any) -> Any:
     if stream_name in VIEW_STREAMS:
         return view_from_msgs(image, info, stream_name)
     return ground_picture_from_msgs(image, info, stream_name)
+
+
+def judge_coverage(track: Track) -> Iterator[tuple[str, str, str]]:
+    """Yield (level, problem, remedy) if the track does not go all the way round."""
+    gaps = track.gaps
+    if not gaps:
+        return
+    arcs = ", ".join(str(g) for g in gaps[:8])
+    arcs += f" and {len(gaps) - 8} more" if len(gaps) > 8 else ""
+    problem = f"the track covers {math.degrees(track.coverage_rad):.1f} of 360 degrees; missing: {arcs}"
+    if track.coverage_rad < MIN_COVERAGE_RAD:
+        yield (
+            ERROR,
+            f"{problem}: no view can be made",
+            "Record the track round the origin of csas_scene, in metres, with poses at most"
+            f" {math.degrees(track.max_gap_rad):g} degrees apart.",
+        )
+        return
+    yield (
+        WARNING,
+        problem,
+        "No views are made in these arcs. Record the track round the whole circle if it was flown.",
+    )
+
+
+def judge_image(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, str]]:
+    """Yield (level, problem, remedy) for whatever image, camera_info and track contradict each other in."""
+    yield from judge_geometry(image.grid, track)
+    yield from judge_band(image.grid, image.acoustics, track)
+    yield from judge_energy(image, track)
+
+
+def judge_amplitude(view: View) -> Iterator[tuple[str, str, str]]:
+    """Yield (level, problem, remedy) if an amplitude view is filled with 0 where it knows nothing."""
+    pixels = view.pixels
+    corners = pixels[[0, 0, -1, -1], [0, -1, 0, -1]]
+    zeros = float(np.mean(pixels == 0))
+    if zeros > MAX_ZEROS and (corners == 0).any():
+        yield (
+            WARNING,
+            f"{100 * zeros:.0f} % of the pixels are exactly 0, out to a corner: shadow that nothing casts",
+            "Write NaN where the view knows nothing, as off the image.",
+        )
 
 
 def judge_geometry(grid: GroundGrid, track: Track) -> Iterator[tuple[str, str, str]]:
@@ -391,9 +455,22 @@ def band_energy(image: CoherentImage, grazing_rad: float) -> BandEnergy:
 def judge_energy(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, str]]:
     """Yield (level, problem, remedy) if the image's energy lies outside its stated band."""
     energy = band_energy(image, track.grazing_rad)
-    if energy.fraction >= GOOD_BAND_ENERGY:
-        return
     low, _, high = image.acoustics.ground_band(track.grazing_rad)
+    # Of an annulus that is filled evenly, 5 and 95 % of the energy lie below these.
+    inner, outer = (math.sqrt(low**2 + share * (high**2 - low**2)) for share in (0.05, 0.95))
+    found, expected = (energy.low_rad_m + energy.high_rad_m) / 2, (inner + outer) / 2
+    shifted = abs(found - expected) > MAX_BAND_SHIFT * (high - low)
+    if energy.fraction >= GOOD_BAND_ENERGY and not shifted:
+        return
+    if energy.fraction >= GOOD_BAND_ENERGY:
+        yield (
+            WARNING,
+            f"the image's energy is centred on K {found:.1f} rad/m,"
+            f" {100 * (found / expected - 1):+.0f} % from the stated band's {expected:.1f}",
+            f"Is the centre frequency {image.acoustics.centre_frequency_hz * found / expected:.0f} Hz? Check"
+            " it and the sound speed (camera_info.d), and the pixel spacing (p), which scales all lengths.",
+        )
+        return
     to_hz = image.acoustics.sound_speed_mps / (4 * math.pi * math.cos(track.grazing_rad))
     yield (
         ERROR if energy.fraction < MIN_BAND_ENERGY else WARNING,

@@ -127,8 +127,8 @@ class Run:
             try:
                 return image_from_sectors(self.sectors())
             except CsasError as error:
-                raise BagError(self._why(f"no image can be summed from the sectors ({error})")) from error
-        raise BagError(self._why("there is no full-circle image"))
+                raise BagError(self.why(f"no image can be summed from the sectors ({error})")) from error
+        raise BagError(self.why("there is no full-circle image"))
 
     def require_track(self) -> Track:
         """Return the track.
@@ -139,12 +139,16 @@ class Run:
             If there is none; the message names what is wrong with it.
         """
         if self.track is None:
-            raise BagError(self._why("there is no track"))
+            raise BagError(self.why("there is no track"))
         return self.track
 
-    def _why(self, lack: str) -> str:
-        found = f": {self.problems[0]}" if self.problems else ""
-        more = f" (and {len(self.problems) - 1} more problems)" if len(self.problems) > 1 else ""
+    def why(self, lack: str) -> str:
+        """Say what is lacking, with the first problem as its reason."""
+        # Damage of the bag itself explains what else is missing.
+        problems = sorted(self.problems, key=lambda problem: problem.topic != "")
+        found = f": {problems[0]}" if problems else ""
+        rest = len(problems) - 1
+        more = f" (and {rest} more problem{'s' if rest > 1 else ''})" if rest > 0 else ""
         return f"{self.path}: {lack}{found}{more}"
 
     def _each(self, stream_name: str, read: Callable[[Any, Any], T]) -> Iterator[T]:

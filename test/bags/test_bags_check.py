@@ -370,3 +370,56 @@ def test_a_spectrum_sign_that_cannot_be_checked_is_a_warning(monkeypatch):
 def test_the_spectrum_sign_is_checked_with_the_method_itself(tmp_path):
     report = check_bag(write_run(tmp_path / "run", annulus_image(), circle()))
     assert any("spectrum sign" in f.problem or "spectrum_sign" in f.problem for f in report.findings)
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_a_frequency_ten_per_cent_off_is_a_warning_that_names_the_right_one(factor):
+    # Wide bands overlap even then: only where the energy is centred shows it.
+    stated = annulus_image(Acoustics(120e3 * factor, 40e3, 1500.0, -1))
+    ((level, problem, remedy),) = judge_energy(stated, circle())
+    assert level == "warning"
+    assert "from the stated band's" in problem
+    named = float(remedy.split("centre frequency ")[1].split(" Hz")[0])
+    assert named == pytest.approx(120e3, rel=0.02)
+
+
+def test_a_track_that_leaves_room_for_no_view_is_an_error(tmp_path):
+    sparse = circle()
+    sparse = Track(sparse.stamps_ns[::10], sparse.positions_m[::10])
+    report = check_bag(write_run(tmp_path / "run", annulus_image(), sparse))
+    assert not report.ok
+    finding = only(report)
+    assert "no view can be made" in finding.problem
+    assert "at most 3 degrees apart" in finding.remedy
+
+
+def test_what_is_wrong_with_many_messages_alike_is_told_once_and_each_is_in_the_json(tmp_path):
+    extra = []
+    for i in range(5):
+        a, b = view_to_msgs(FACTORY, view(i), "shadow")
+        b.distortion_model = "plumb_bob"
+        extra += [("shadow/image", a), ("shadow/camera_info", b)]
+    report = check_bag(write_run(tmp_path / "run", None, circle(), extra=extra))
+    assert str(report).count("plumb_bob") == 1
+    assert "(5 messages alike)" in str(report)
+    assert sum("plumb_bob" in f["problem"] for f in report.as_dict()["findings"]) == 5
+
+
+def test_a_view_filled_with_zeros_off_the_image_is_a_warning_and_one_with_nan_is_none(tmp_path):
+    def checked(name, outside):
+        pixels = np.array(view(3).pixels)
+        pixels[:2] = outside
+        a, b = view_to_msgs(FACTORY, View(view(3).info, pixels), "shadow")
+        extra = [("shadow/image", a), ("shadow/camera_info", b)]
+        return check_bag(write_run(tmp_path / name, None, circle(), extra=extra))
+
+    assert "exactly 0, out to a corner" in only(checked("zeros", 0.0), "warning").problem
+    assert not [f for f in checked("nan", np.nan).findings if f.level == "warning"]
+
+
+def test_a_second_image_is_a_warning(tmp_path):
+    second = replace(annulus_image(), stamp_ns=annulus_image().stamp_ns + 1)
+    a, b = coherent_image_to_msgs(FACTORY, second)
+    bag = write_run(tmp_path / "run", annulus_image(), circle(), extra=[("image", a), ("camera_info", b)])
+    finding = next(f for f in check_bag(bag).findings if f.level == "warning")
+    assert "second image" in finding.problem

@@ -18,7 +18,7 @@ import trimesh
 import csas_shadow_ros
 from csas_shadow_ros.bags import BagReader, BagWriter, check_bag, copy, read_run, write_run
 from csas_shadow_ros.cli import build_parser, main
-from csas_shadow_ros.core.geometry import CoherentImage
+from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, Track
 from csas_shadow_ros.core.parameters import STAGES
 from csas_shadow_ros.parameter_file import pipeline_parameters, read_parameter_file
 from csas_shadow_ros.results import ResultsError, ResultsWriter, is_results_folder, read_report
@@ -364,6 +364,7 @@ def test_a_wrong_spectrum_sign_is_named_and_can_be_overridden_with_a_notice(tiny
     assert refused.code == 1
     assert "spectrum_sign is -1" in refused.err
     assert "expected +1" in refused.err
+    assert "run with --spectrum-sign +1" in refused.err
     assert not (tmp_path / "r").exists()
     said = Said(
         "run", tmp_path / "b", "--out", tmp_path / "r", "--no-bag", "--no-figures", "--step-deg", "30",
@@ -373,6 +374,57 @@ def test_a_wrong_spectrum_sign_is_named_and_can_be_overridden_with_a_notice(tiny
     assert "the bag states -1, +1 is used" in said.err
     assert "overridden to +1" in said.out
     assert read_report(tmp_path / "r")["spectrum_sign"]["override"] == 1
+
+
+def spoilt(bag, tmp_path, stated=None, poses=slice(None)):
+    """Write the box's run with another band or with fewer poses."""
+    image, track = bag.run.image, bag.run.track
+    image = dataclasses.replace(image, acoustics=stated or image.acoustics)
+    return write_run(tmp_path / "b", image, Track(track.stamps_ns[poses], track.positions_m[poses]))
+
+
+@pytest.mark.parametrize("command", ["run", "replay"])
+def test_a_band_that_the_image_contradicts_is_refused_and_not_called_no_object(
+    tiny_box_bag, tmp_path, command
+):
+    bag = spoilt(tiny_box_bag, tmp_path, stated=Acoustics(60.0, 24.0, 1500.0, 1))  # kHz, not Hz
+    said = Said(command, bag, "--out", tmp_path / "r", *QUICK)
+    assert said.code == 1
+    assert said.err.count("\n") == 1
+    assert "of the image's energy lies in its stated band" in said.err
+    assert "no object" not in said.out
+    assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.parametrize(
+    ("poses", "expected"),
+    [
+        (slice(None, None, 20), "no view can be made. Record the track"),
+        (slice(20), "none of 36 views could be made"),
+    ],
+    ids=["too far apart", "too short an arc"],
+)
+def test_a_track_of_which_no_view_can_be_made_is_refused_and_not_called_no_object(
+    tiny_box_bag, tmp_path, poses, expected
+):
+    said = run_quickly(spoilt(tiny_box_bag, tmp_path, poses=poses), tmp_path / "r")
+    assert said.code == 1
+    assert expected in said.err
+    assert "no object" not in said.out
+    assert not (tmp_path / "r").exists()
+
+
+def test_views_of_which_none_is_usable_are_refused_with_the_first_ones_fault(results, tmp_path):
+    with BagWriter(tmp_path / "b") as writer:
+        for message in BagReader(results / "result.mcap").messages(["shadow/image", "shadow/camera_info"]):
+            decoded = message.decode()
+            if message.topic.endswith("camera_info"):
+                decoded.d = decoded.d[:4]
+            writer.write(message.topic, decoded)
+    said = run_quickly(tmp_path / "b", tmp_path / "r")
+    assert said.code == 1
+    assert "none of the 36 shadow views is usable" in said.err
+    assert "shadow/camera_info.d has 4 entries; expected 9" in said.err
 
 
 def test_a_failed_run_says_one_line_without_a_traceback_and_debug_shows_it(tmp_path):
