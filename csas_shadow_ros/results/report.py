@@ -10,7 +10,7 @@ import math
 import platform
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -228,7 +228,7 @@ def build_report(
             "used": used,
             "rejected": lost,
             "lost": context.views_lost,
-            "reasons": dict(Counter(_kind(r) for r in result.rejected.values()).most_common()),
+            "reasons": _reasons(result.rejected.values()),
             "rejected_by_aspect_deg": {f"{a:g}": r for a, r in sorted(result.rejected.items())},
         },
         "levels": _levels(result.levels, aspects_deg),
@@ -259,10 +259,14 @@ def no_object_reason(result: Result) -> str:
     return "no object: no voxel of the carved volume lies in shadow from all sides"
 
 
-def _kind(reason: str) -> str:
-    """Return a reason without its numbers, to count the same ones together."""
-    words = ("#" if any(c.isdigit() for c in word) else word for word in reason.split())
-    return " ".join(words)
+def _reasons(reasons: Iterable[str]) -> dict[str, int]:
+    """Count reasons that differ in nothing but numbers together, under the first of them."""
+    first: dict[str, str] = {}
+    counts: Counter[str] = Counter()
+    for reason in reasons:
+        kind = " ".join("#" if any(c.isdigit() for c in word) else word for word in reason.split())
+        counts[first.setdefault(kind, reason)] += 1
+    return dict(counts.most_common())
 
 
 def report_text(report: Mapping[str, Any]) -> str:
@@ -318,7 +322,9 @@ def summary(report: Mapping[str, Any]) -> str:
     lines.append(f"views: {views['in']} in, {views['used']} in the grid, {views['rejected']} not used")
     if views["lost"]:
         lines[-1] += f", {views['lost']} lost on their way"
-    lines += [f"  {n} not used: {reason}" for reason, n in views["reasons"].items()]
+    lines += [
+        f"  {n} not used{', the first' if n > 1 else ''}: {reason}" for reason, n in views["reasons"].items()
+    ]
     sign = report["spectrum_sign"]
     lines.append(
         f"spectrum sign: {sign['why'] if sign['verdict'] != 'not checked' else 'not checked, ' + sign['why']}"

@@ -22,6 +22,7 @@ from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, Track
 from csas_shadow_ros.core.parameters import STAGES
 from csas_shadow_ros.parameter_file import pipeline_parameters, read_parameter_file
 from csas_shadow_ros.results import ResultsError, ResultsWriter, is_results_folder, read_report
+from csas_shadow_ros.results.report import _reasons
 from csas_shadow_ros.simulation import get_profile, simulate_bag
 from msg_adapters.topics import STREAMS
 
@@ -190,6 +191,11 @@ def test_the_summary_has_found_and_true_dimensions_side_by_side(results):
     assert "0.800 m" in length
     assert any("36 in, 36 in the grid, 0 not used" in line for line in lines)
     assert Said("info", results).out.startswith(lines[0])
+
+
+def test_reasons_that_differ_in_numbers_alone_are_counted_under_the_first_with_its_numbers():
+    gaps = [f"track gap: the track covers {n}% of the 12° aperture at aspect {n / 10}°" for n in (50, 33, 7)]
+    assert _reasons([*gaps, "view is dark"]) == {gaps[0]: 3, "view is dark": 1}
 
 
 def test_every_figure_is_there_and_none_is_blank(results):
