@@ -117,7 +117,7 @@ setup(
     entry_points={
         "console_scripts": [
             "csas-shadow = csas_shadow_ros.cli:main",
-            *(f"{node} = {NAME}.nodes.{node}:main" for node in NODES),
+            *(f"{node} = {NAME}.nodes.start:{node}" for node in NODES),
         ]
     },
     zip_safe=False,

@@ -737,7 +737,7 @@ def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> in
     Returns
     -------
     int
-        0; 2 if a parameter is refused or the node cannot be configured.
+        0; 2 if a parameter or an argument is refused or the node cannot be configured.
     """
     if "HOME" not in os.environ:
         # rclpy.init raises where it can find no directory for its log.
@@ -748,7 +748,12 @@ def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> in
         signal.signal(number, lambda *_: stop.set())
     context = Context()
     argv = [sys.argv[0], *(sys.argv[1:] if arguments is None else arguments)]
-    rclpy.init(args=argv, context=context, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=argv, context=context, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        # rclpy's own errors: arguments or a parameter file that cannot be read.
+        sys.stderr.write(f"{kind.name}: {error}\n")
+        return 2
     code = 0
     try:
         try:

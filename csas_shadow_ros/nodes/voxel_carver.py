@@ -46,6 +46,7 @@ class VoxelCarverNode(CsasNode):
     def forget(self) -> None:
         """Drop the grid."""
         self.carver: Carver | None = None
+        self.object_voxels = 0
 
     def waiting(self) -> str:
         """Say so if views wait for the target."""
@@ -77,8 +78,13 @@ class VoxelCarverNode(CsasNode):
 
     def tick(self) -> None:
         """Publish what has changed."""
+        before = self.growing.complete
         self.growing.period_s = 1.0 / self.parameters.publish_hz
         self.growing.tick(time.monotonic())
+        if self.growing.complete and not before:
+            views = len(self.carver.stamps) if self.carver else 0
+            found = f"an object of {self.object_voxels} voxels" if self.object_voxels else "no object"
+            self.get_logger().info(f"complete: {views} views, {found}; the result is published")
 
     def wanted(self) -> bool:
         """Say whether anybody looks at unfinished results."""
@@ -91,6 +97,7 @@ class VoxelCarverNode(CsasNode):
             self.mesh.publish(mesh_to_msg(self.messages, None, self.now_ns()))
             return
         grid, stamp = self.carver.grid(), max(self.carver.stamps)
+        self.object_voxels = int(grid.occupied.sum())
         image, info = voxel_grid_to_msgs(self.messages, grid.volume, grid.likelihood, stamp)
         self.grid_info.publish(info)
         self.grid_image.publish(image)

@@ -1,0 +1,41 @@
+"""Entry points of the nodes' executables, which can be stopped from their first moment on.
+
+A node imports libraries for a second or more, and some of them swallow the KeyboardInterrupt that
+Ctrl-C raises meanwhile: the node would start after all, and `ros2 launch` wait for it in vain.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+from functools import partial
+
+
+def run(name: str) -> int:
+    """Import a node and run it.
+
+    Parameters
+    ----------
+    name : str
+        Name of its module.
+
+    Returns
+    -------
+    int
+        The node's exit status; a signal before it began ends the process with 0.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # Nothing has begun that would have to be brought to an end. `run_node` sets its own handlers.
+        signal.signal(number, lambda *_: os._exit(0))
+    status: int = importlib.import_module(f"{__package__}.{name}").main()
+    return status
+
+
+sub_aperture = partial(run, "sub_aperture")
+shadow_enhancement = partial(run, "shadow_enhancement")
+shadow_likelihood = partial(run, "shadow_likelihood")
+voxel_carver = partial(run, "voxel_carver")
+composites = partial(run, "composites")
+bag_player = partial(run, "bag_player")
+bag_recorder = partial(run, "bag_recorder")
