@@ -1,6 +1,12 @@
 """Start the whole graph: `ros2 launch csas_shadow_ros csas_shadow.launch.py bag:=my_run`.
 
-Without `bag` the graph waits for somebody to publish (`ros2 bag play`, a sonar processor).
+Without `bag` the graph waits for somebody to publish: a sonar processor, or
+`ros2 bag play --delay 5 --wait-for-all-acked 0 my_run` (a player that ends at once takes the latched
+image with it).
+
+The graph runs until Ctrl-C, so that its results stay on their topics; voxel_carver says when all views
+are in. Ctrl-C finishes the bag of `out`. A parameter or bag that is refused ends the launch with one line
+that says which.
 """
 
 from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
@@ -14,6 +20,15 @@ from launch import LaunchDescription
 
 PACKAGE = "csas_shadow_ros"
 STAGES = ("sub_aperture", "shadow_enhancement", "shadow_likelihood", "voxel_carver")
+#: What a node exits with when it refuses its parameters, a bag among them.
+REFUSED = 2
+
+
+def end_if_refused(event, _):
+    """End the launch, as a failure, where a restart would only be refused again."""
+    if event.returncode == REFUSED:
+        # A Shutdown action would end it with the exit status of success.
+        raise RuntimeError(f"{event.process_name} refused what it was given; its own line says why")
 
 
 def generate_launch_description():
@@ -34,6 +49,9 @@ def generate_launch_description():
             # Flow control brings a restarted node everything that it lacks.
             respawn=LaunchConfiguration("respawn"),
             respawn_delay=1.0,
+            # On Ctrl-C: the recorder finishes its bag, and a busy machine takes its time.
+            sigterm_timeout="20",
+            on_exit=end_if_refused,
         )
 
     playing = {
