@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import dataclasses
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +19,8 @@ from .core.parameters import STAGES, PipelineParameters
 
 PROGRAM = "csas-shadow"
 OK, FAILED, USAGE = 0, 1, 2
+#: Shadows may leave the image by so much of its half side before a simulation is said to be too small.
+_MAX_REACH = 1.6
 
 _DESCRIPTION = """\
 Shadows of a circular synthetic aperture sonar (CSAS) run, as pictures and as a 3-D shape.
@@ -456,6 +459,15 @@ def _simulate(arguments: argparse.Namespace, console: Console) -> int:
     out = Path(arguments.out_bag)
     length, width, height = run.truth.dims_m
     grid = run.image.grid
+    _, _, radius, sonar_height = run.track.circle
+    # The target's far corner and the shadow behind its top, against where the image ends.
+    reach = math.hypot(*run.truth.position_m) + math.hypot(length, width) / 2 + height * radius / sonar_height
+    side = min(grid.rows, grid.cols) * grid.spacing_m / 2
+    if height and reach > _MAX_REACH * side:
+        console.notice(
+            f"the target's shadows reach {reach:.1f} m from the middle, but the image ends at {side:.1f} m:"
+            " its shape will not come out; take a larger profile or a smaller target"
+        )
     document = {
         "bag": str(out.resolve()),
         "truth": [str(out.with_name(f"{out.name}.truth.{kind}").resolve()) for kind in ("stl", "json")],

@@ -91,6 +91,15 @@ def test_simulate_then_check_then_info_agree_on_the_bag(tmp_path):
     assert told["start_from"] == ["image"]
 
 
+@pytest.mark.parametrize(("target", "told"), [("cylinder", True), ("box", False)])
+def test_a_target_whose_shadows_leave_the_image_by_far_is_told_of_when_it_is_simulated(
+    tmp_path, target, told
+):
+    said = Said("simulate", tmp_path / "b", "--profile", "tiny", "--target", target)
+    assert said.code == 0
+    assert ("its shape will not come out" in said.err) is told
+
+
 def test_info_says_in_words_what_a_bag_holds(tiny_box_bag):
     said = Said("info", tiny_box_bag.path)
     assert "512 x 512 pixels of 5 mm" in said.out
