@@ -7,6 +7,7 @@ every row of the view to the target's own range r₀ lays these shadows over one
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numba
 import numpy as np
@@ -73,7 +74,7 @@ def _shrink_rows(known: NDArray[np.bool_], margins: NDArray[np.int64]) -> None: 
                 known[i, j] = False
 
 
-def enhance(view: View, target_m: tuple[float, float], parameters: ShadowParameters | None = None) -> View:
+def focus(view: View, target_m: tuple[float, float], parameters: ShadowParameters | None = None) -> View:
     """Focus a sub-aperture view's shadows at the target's range.
 
     Parameters
@@ -88,8 +89,9 @@ def enhance(view: View, target_m: tuple[float, float], parameters: ShadowParamet
     Returns
     -------
     View
-        float32 amplitude. NaN off the image, and where part of the aperture looked past the image's
-        edge: pixel Δ behind the focus needs Δ tan(w/2) of image to either side.
+        complex64, but for the phase σΔK₀ common to a row (see `focus_phase_rate`). NaN off the image, and
+        where part of the aperture looked past the image's edge: pixel Δ behind the focus needs Δ tan(w/2)
+        of image to either side.
 
     Raises
     ------
@@ -109,10 +111,7 @@ def enhance(view: View, target_m: tuple[float, float], parameters: ShadowParamet
     if not known.any():
         raise ViewError("sub-aperture view holds no finite pixel")
     r0 = focus_range(info, target_m)
-    focused = ViewInfo(
-        info.stamp_ns, info.camera, info.acoustics, info.aspect_rad, info.aperture_rad, info.carrier_rad_m, r0
-    )
-    amplitude = np.abs(view.pixels)
+    pixels = view.pixels.astype(np.complex64)
     offsets = info.down_range_of_rows() - r0
     behind = np.flatnonzero(offsets > 0.0)
     if p.enhancement != "none" and behind.size:
@@ -121,16 +120,32 @@ def enhance(view: View, target_m: tuple[float, float], parameters: ShadowParamet
         reach = np.ceil(offsets[behind] * math.tan(info.aperture_rad / 2.0) / spacing).astype(np.int64)
         # What leaves the view on one side must not come back on the other.
         length = scipy.fft.next_fast_len(cols + int(min(reach.max(), cols)))
-        rows = np.where(known[behind], view.pixels[behind], 0).astype(np.complex64)
+        rows = np.where(known[behind], pixels[behind], np.complex64(0))
         spectrum = scipy.fft.fft(rows, n=length, axis=1, overwrite_x=True)
         carrier = float(cross_range_axis(info.aspect_rad) @ np.asarray(info.carrier_rad_m))
         k_c = 2.0 * math.pi * scipy.fft.fftfreq(length, spacing) + carrier
         rate = focus_phase_rate(k_c, info, p.enhancement)
         _apply_phase(spectrum, offsets[behind].astype(np.float32), rate.astype(np.float32))
-        rows = scipy.fft.ifft(spectrum, axis=1, overwrite_x=True)[:, :cols]
-        amplitude[behind] = np.abs(rows)
+        pixels[behind] = scipy.fft.ifft(spectrum, axis=1, overwrite_x=True)[:, :cols]
         margins = np.zeros(info.camera.rows, np.int64)
         margins[behind] = reach
         _shrink_rows(known, margins)
-    amplitude[~known] = np.nan
-    return View(focused, amplitude.astype(np.float32, copy=False))
+    pixels[~known] = np.complex64(complex(math.nan, math.nan))
+    return View(replace(info, focus_range_m=r0), pixels)
+
+
+def enhance(view: View, target_m: tuple[float, float], parameters: ShadowParameters | None = None) -> View:
+    """Focus a sub-aperture view's shadows and take the amplitude; see `focus`.
+
+    Returns
+    -------
+    View
+        float32 amplitude, NaN where the view knows nothing.
+
+    Raises
+    ------
+    ViewError
+        If the view is not complex or holds nothing.
+    """
+    focused = focus(view, target_m, parameters)
+    return replace(focused, pixels=np.abs(focused.pixels))
