@@ -114,6 +114,8 @@ class CsasNode(LifecycleNode):
         self.active = False
         self.counts: Counter[str] = Counter()
         self.reasons: Counter[str] = Counter()
+        #: The first reason of each kind, word for word.
+        self.examples: dict[str, str] = {}
         self.busy_s = 0.0
         #: What stops the node from working, if anything does; shown in diagnostics and heartbeats.
         self.error = ""
@@ -228,6 +230,7 @@ class CsasNode(LifecycleNode):
         if kind not in self.reasons and len(self.reasons) >= _MAX_KINDS:
             kind = "other reasons"
         self.reasons[kind] += 1
+        self.examples.setdefault(kind, reason if kind != "other reasons" else kind)
         self.log_throttled(kind, reason, level)
 
     def log_throttled(self, kind: str, text: str, level: str) -> None:
@@ -289,7 +292,7 @@ class CsasNode(LifecycleNode):
             values[name] = str(count)
             if now > since:
                 values[f"{name} per second"] = f"{(count - before) / (now - since):.1f}"
-        values |= {f"rejected: {kind}": str(n) for kind, n in self.reasons.most_common()}
+        values |= {f"rejected: {self.examples[kind]}": str(n) for kind, n in self.reasons.most_common()}
         values["busy seconds"] = f"{self.busy_s:.3f}"
         values |= {k: str(v) for k, v in self.state_counts().items()}
         for source in self.sources:

@@ -9,6 +9,7 @@ import math
 import sys
 from typing import Any
 
+from csas_shadow_ros.bags.check import ERROR, judge_coverage, judge_image
 from csas_shadow_ros.core.errors import CsasError, TrackError, ViewError
 from csas_shadow_ros.core.geometry import CoherentImage, Track
 from csas_shadow_ros.core.parameters import SubApertureParameters, TargetParameters
@@ -80,9 +81,12 @@ class SubApertureNode(CsasNode):
         pair = self.pairer.add(msg, is_info=is_info)
         # A latched topic comes twice, by both subscriptions: its orphans are no news.
         self.pairer.orphans.clear()
-        if pair is None or self.failed:
+        if pair is None:
             return
         stamp = stamp_to_ns(pair[0].header.stamp, "image.header.stamp")
+        if self.failed and stamp != self.image_stamp:
+            # What came before could not be processed at all: this may be it put right.
+            self.failed, self.error, self.image_stamp = False, "", None
         if self.image_stamp is not None:
             if stamp != self.image_stamp:
                 raise ViewError(
@@ -104,6 +108,9 @@ class SubApertureNode(CsasNode):
                     f" {len(self.sub_apertures.track)}; it is not used"
                 )
             return
+        for level, problem, remedy in judge_coverage(track):
+            if level == ERROR:
+                raise TrackError(f"{problem}. {remedy}")
         if self.track is None or len(track) >= len(self.track):
             self.track = track
             self.begin_guard.trigger()
@@ -132,6 +139,9 @@ class SubApertureNode(CsasNode):
         if self.image is None or self.track is None or self.sub_apertures is not None or self.failed:
             return
         try:
+            for level, problem, remedy in judge_image(self.image, self.track):
+                if level == ERROR:
+                    raise ViewError(f"{problem}. {remedy}")
             spectrum = Spectrum.of_image(self.image)
             target = self.find_target(self.image, self.track, spectrum)
             p = part(self.parameters, SubApertureParameters)
