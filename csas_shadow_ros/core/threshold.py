@@ -26,6 +26,8 @@ _NO_OBJECT = 0.5
 _DARKEST = 27
 #: Pieces of less than this fraction of the largest piece are noise.
 _PIECE = 0.05
+#: An object has at least this many voxels in its largest piece; fewer are noise, and no object.
+_LEAST_VOXELS = 27
 
 
 def object_threshold(likelihood: NDArray[np.float32], method: str) -> float:
@@ -82,6 +84,8 @@ def supported(dark: NDArray[np.bool_], likelihood: NDArray[np.float32], limit: f
 def occupied_voxels(likelihood: NDArray[np.float32], threshold: float, method: str) -> NDArray[np.bool_]:
     """Return the object's voxels: under the threshold, supported, without stray pieces.
 
+    A few voxels alone are no object: the smallest is 27 voxels in one piece.
+
     Parameters
     ----------
     likelihood : ndarray of float32, shape (nz, ny, nx)
@@ -97,8 +101,8 @@ def occupied_voxels(likelihood: NDArray[np.float32], threshold: float, method: s
         dark = likelihood < threshold
     body = supported(dark, likelihood, max(_SOFT_SUPPORT, threshold) if method == "soft" else threshold)
     labels, count = scipy.ndimage.label(body, np.ones((3, 3, 3), bool))
-    if count < 2:
-        return body
-    sizes = np.bincount(labels.ravel())
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
     sizes[0] = 0
+    if sizes.max() < _LEAST_VOXELS:
+        return np.zeros(likelihood.shape, bool)
     return np.asarray((sizes >= _PIECE * sizes.max())[labels] & body)

@@ -403,3 +403,12 @@ def test_a_volume_stands_on_the_seabed_round_its_position():
 def test_a_volume_out_of_bounds_is_refused(arguments, match):
     with pytest.raises((ParameterError, GeometryError), match=match):
         Volume(*arguments)
+
+
+@pytest.mark.parametrize("method", ["consensus", "hard", "soft"])
+def test_a_few_voxels_are_no_object(method):
+    likelihood = np.full((6, 6, 6), 0.9, np.float32)
+    likelihood[0:2, 2:4, 2:4] = 0.0
+    assert not occupied_voxels(likelihood, 0.04, method).any()
+    likelihood[0:3, 1:4, 1:4] = 0.0
+    assert occupied_voxels(likelihood, 0.04, method).sum() == 27
