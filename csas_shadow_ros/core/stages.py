@@ -48,7 +48,7 @@ class StagedView:
     mask: View | None = None
 
 
-def spread_views(views: Iterable[View], count: int) -> list[View]:
+def spread_views(views: Iterable[View], count: int, start_rad: float = 0.0) -> list[View]:
     """Keep the views nearest to `count` aspects round the circle, each once; memory holds no more.
 
     Parameters
@@ -56,13 +56,16 @@ def spread_views(views: Iterable[View], count: int) -> list[View]:
     views : iterable of View
         Any number, in any order.
     count : int
-        Aspects 0, 2π/count, ...
+        Number of aspects.
+    start_rad : float
+        The first of them; the others follow every 2π/count.
     """
     kept: list[tuple[float, View] | None] = [None] * count
     step = TWO_PI / count
     for view in views:
-        slot = round((view.info.aspect_rad % TWO_PI) / step) % count
-        off = abs(float(wrap_angle(view.info.aspect_rad - slot * step)))
+        aspect = view.info.aspect_rad - start_rad
+        slot = round((aspect % TWO_PI) / step) % count
+        off = abs(float(wrap_angle(aspect - slot * step)))
         best = kept[slot]
         if best is None or off < best[0]:
             kept[slot] = (off, view)

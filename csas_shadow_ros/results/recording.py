@@ -112,7 +112,8 @@ def _adopt_views(writer: ResultsWriter, run: Run, result: Result, p: PipelinePar
     shown: dict[int, dict[str, View]] = {}
     # Of the stage that says most of where a view looked, six; of the others, the same six.
     first = "shadow" if "shadow" in held else held[0]
-    for view in spread_views(run.views(first), len(SIX_ASPECTS_DEG)):
+    start = math.radians(SIX_ASPECTS_DEG[0])
+    for view in spread_views(run.views(first), len(SIX_ASPECTS_DEG), start):
         shown[view.info.stamp_ns] = {}
     for stage in held:
         for view in run.views(stage):
