@@ -319,9 +319,10 @@ def summary(report: Mapping[str, Any]) -> str:
     if grid:
         threshold = "none" if grid["threshold"] is None else f"{grid['threshold']:.4f}"
         lines.append(f"{grid['method']} carving, voxels of {grid['voxel_size_m']:g} m, threshold {threshold}")
-    lines.append(f"views: {views['in']} in, {views['used']} in the grid, {views['rejected']} not used")
-    if views["lost"]:
-        lines[-1] += f", {views['lost']} lost on their way"
+    lines.append(
+        f"views: {views['in']} in, {views['used']} in the grid, {views['rejected']} not used,"
+        f" {views['lost']} lost"
+    )
     lines += [
         f"  {n} not used{', the first' if n > 1 else ''}: {reason}" for reason, n in views["reasons"].items()
     ]

@@ -198,7 +198,7 @@ def test_the_summary_has_found_and_true_dimensions_side_by_side(results):
     lines = (results / "summary.txt").read_text().splitlines()
     length = next(line for line in lines if line.startswith("length"))
     assert "0.800 m" in length
-    assert any("36 in, 36 in the grid, 0 not used" in line for line in lines)
+    assert any("36 in, 36 in the grid, 0 not used, 0 lost" in line for line in lines)
     assert Said("info", results).out.startswith(lines[0])
 
 
