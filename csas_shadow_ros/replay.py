@@ -34,7 +34,7 @@ from .core.mesh import Dimensions, measure
 from .core.parameters import PipelineParameters
 from .core.stages import target_of_views
 from .core.target import Target
-from .core.threshold import object_threshold, occupied_voxels
+from .core.threshold import thresholded
 from .core.volume import VoxelGrid
 from .nodes.params import NODES, check, yaml_text
 
@@ -719,14 +719,10 @@ def _collect(
         result.target = None if box is None else Target((box.centre_m[0], box.centre_m[1]), box.size_m)
     if result.views_used:
         _, volume, likelihood = voxel_grid_from_msgs(got["voxel_grid/image"], got["voxel_grid/camera_info"])
-        threshold = p.carving.threshold or object_threshold(likelihood, p.carving.method)
-        occupied = occupied_voxels(likelihood, threshold, p.carving.method)
         _, _, views = voxel_grid_from_msgs(
             got["voxel_views/image"], got["voxel_views/camera_info"], "voxel_views"
         )
-        result.grid = VoxelGrid(
-            volume, likelihood, views.astype(np.uint16), threshold, occupied, p.carving.method
-        )
+        result.grid = thresholded(volume, likelihood, views.astype(np.uint16), p.carving)
         result.mesh = mesh_from_msg(got["mesh"])
         result.dimensions = measure(result.mesh) if result.mesh is not None else None
     for name in ("multilook", "color_by_aspect"):

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from .errors import ParameterError, ViewError
 from .geometry import View
 from .parameters import CarvingParameters
+from .threshold import thresholded
 from .volume import Volume, VoxelGrid
 
 #: l_out is accumulated in steps of 1/4096, far below the spread of its estimate.
@@ -182,13 +183,7 @@ class Carver:
         VoxelGrid
             With NaN threshold and nothing occupied where there is no object.
         """
-        from .threshold import object_threshold, occupied_voxels
-
-        likelihood = self.likelihood()
-        p = self.parameters
-        threshold = p.threshold or object_threshold(likelihood, p.method)
-        occupied = occupied_voxels(likelihood, threshold, p.method)
-        return VoxelGrid(self.volume, likelihood, self._count.copy(), threshold, occupied, p.method)
+        return thresholded(self.volume, self.likelihood(), self._count.copy(), self.parameters)
 
 
 def carve(views: list[View], volume: Volume, parameters: CarvingParameters | None = None) -> VoxelGrid:

@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import trimesh
 
@@ -27,6 +28,9 @@ from .shadow import enhance
 from .subaperture import Spectrum, SubApertures
 from .target import SignEvidence, Target, choose_target, find_target, spectrum_sign_evidence
 from .volume import Volume, VoxelGrid
+
+In = TypeVar("In")
+Out = TypeVar("Out")
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,13 +165,13 @@ def run(
             return error
 
     aspects = [float(a) for a in sub_apertures.aspects_rad]
-    for done, (aspect, view) in enumerate(_in_order(make, aspects, workers), start=1):
+    for done, (aspect, view) in enumerate(in_order(make, aspects, workers), start=1):
         if isinstance(view, ViewError):
             result.rejected[round(math.degrees(aspect), 6)] = str(view)
         elif isinstance(view, View):
-            _compose(result, view)
+            compose(result, view)
         else:
-            _compose(result, view.sub_aperture)
+            compose(result, view.sub_aperture)
             _integrate(result, carvers, view)
             if on_view:
                 on_view(view)
@@ -189,7 +193,8 @@ def _carvers(target: Target, parameters: CarvingParameters) -> list[Carver]:
     return [Carver(volume, parameters), Carver(volume, parameters.other())]
 
 
-def _compose(result: Result, view: View) -> None:
+def compose(result: Result, view: View) -> None:
+    """Add a view to the run's composites."""
     if result.composites is None:
         result.composites = Composites.for_view(view)
     result.composites.integrate(view)
@@ -213,14 +218,12 @@ def _integrate(result: Result, carvers: list[Carver], view: ProcessedView) -> No
     result.levels[view.shadow.info.stamp_ns] = (levels.seabed_level, levels.contrast, levels.estimated)
 
 
-def _in_order(
-    make: Callable[[float], ProcessedView | View | ViewError], aspects: list[float], workers: int
-) -> Iterator[tuple[float, ProcessedView | View | ViewError]]:
-    """Make the views in threads, at most a few ahead, and give them in order of aspect."""
-    waiting: deque[tuple[float, Future[ProcessedView | View | ViewError]]] = deque()
+def in_order(function: Callable[[In], Out], items: Iterable[In], workers: int) -> Iterator[tuple[In, Out]]:
+    """Apply a function in threads, at most a few items ahead, and give the results in order."""
+    waiting: deque[tuple[In, Future[Out]]] = deque()
     with ThreadPoolExecutor(workers) as pool:
-        for aspect in aspects:
-            waiting.append((aspect, pool.submit(make, aspect)))
+        for item in items:
+            waiting.append((item, pool.submit(function, item)))
             if len(waiting) > 2 * workers:
                 first, future = waiting.popleft()
                 yield first, future.result()

@@ -9,20 +9,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 from .carving import Carver
-from .composites import Composites
 from .errors import NoTargetError, ParameterError, ViewError
 from .geometry import TWO_PI, View, fit_target_to_focus, wrap_angle
 from .likelihood import Levels, outside_likelihood, view_levels
 from .mesh import measure, mesh_from_grid
 from .parameters import PipelineParameters, ShadowParameters, TargetParameters
-from .pipeline import Result
+from .pipeline import Result, compose, in_order
 from .segmentation import require_silhouette, segment_shadow
 from .shadow import enhance
 from .target import Search, Target, choose_target, search_views
@@ -32,9 +28,6 @@ from .volume import Volume
 STAGES = ("sub_aperture", "shadow", "likelihood", "shadow_mask")
 #: How many views from all round look for the target.
 _SEARCH_VIEWS = 36
-
-In = TypeVar("In")
-Out = TypeVar("Out")
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,12 +208,10 @@ def run_views(
             return error
 
     done = 0
-    for view, staged in _ahead(make, views(), workers):
+    for view, staged in in_order(make, views(), workers):
         done += 1
         if stage in ("sub_aperture", "shadow"):
-            if result.composites is None:
-                result.composites = Composites.for_view(view)
-            result.composites.integrate(view)
+            compose(result, view)
         if isinstance(staged, ViewError):
             result.rejected[_aspect_deg(view)] = str(staged)
         elif carvers:
@@ -271,17 +262,3 @@ def _integrate(result: Result, carvers: list[Carver], staged: StagedView, view: 
         levels = staged.levels
         stamp = view.info.stamp_ns
         result.levels[stamp] = (levels.seabed_level, levels.contrast, levels.estimated)
-
-
-def _ahead(function: Callable[[In], Out], items: Iterable[In], workers: int) -> Iterator[tuple[In, Out]]:
-    """Apply a function in threads, at most a few items ahead, and give the results in order."""
-    waiting: deque[tuple[In, Future[Out]]] = deque()
-    with ThreadPoolExecutor(workers) as pool:
-        for item in items:
-            waiting.append((item, pool.submit(function, item)))
-            if len(waiting) > 2 * workers:
-                first, future = waiting.popleft()
-                yield first, future.result()
-        while waiting:
-            first, future = waiting.popleft()
-            yield first, future.result()

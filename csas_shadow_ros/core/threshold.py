@@ -8,6 +8,9 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
+from .parameters import CarvingParameters
+from .volume import Volume, VoxelGrid
+
 #: Soft: where the threshold lies between the darkest voxels (0) and the brightest (1) of the volume. A
 #: voxel just outside the object is bright in some views only: those that look past the object's side.
 _SOFT_LEVEL = 0.115
@@ -106,3 +109,28 @@ def occupied_voxels(likelihood: NDArray[np.float32], threshold: float, method: s
     if sizes.max() < _LEAST_VOXELS:
         return np.zeros(likelihood.shape, bool)
     return np.asarray((sizes >= _PIECE * sizes.max())[labels] & body)
+
+
+def thresholded(
+    volume: Volume,
+    likelihood: NDArray[np.float32],
+    views: NDArray[np.uint16],
+    parameters: CarvingParameters,
+) -> VoxelGrid:
+    """Make the grid of carved likelihoods, by the threshold that is given or by the automatic one.
+
+    Parameters
+    ----------
+    volume : Volume
+        The lattice.
+    likelihood : ndarray of float32, shape (nz, ny, nx)
+        NaN unknown.
+    views : ndarray of uint16, shape (nz, ny, nx)
+        How many views know something of each voxel.
+    parameters : CarvingParameters
+        Method and threshold.
+    """
+    method = parameters.method
+    threshold = parameters.threshold or object_threshold(likelihood, method)
+    occupied = occupied_voxels(likelihood, threshold, method)
+    return VoxelGrid(volume, likelihood, views, threshold, occupied, method)
