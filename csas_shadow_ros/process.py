@@ -313,8 +313,7 @@ def told_once(problems: Sequence[Problem]) -> list[str]:
     for problem in problems:
         alike.setdefault((problem.topic, problem.reason), []).append(problem)
     return [
-        str(same[0]) + (f" ({len(same)} messages alike)" if len(same) > 1 else "")
-        for same in alike.values()
+        str(same[0]) + (f" ({len(same)} messages alike)" if len(same) > 1 else "") for same in alike.values()
     ]
 
 

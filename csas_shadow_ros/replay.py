@@ -570,9 +570,7 @@ def _plan(bag: str | Path, stage: str, p: PipelineParameters) -> tuple[str, Targ
     hard = p.carving.takes_masks
     if chosen in ("likelihood", "shadow_mask") and (chosen == "shadow_mask") != hard:
         expected = "hard" if chosen == "shadow_mask" else "one that takes likelihoods (soft)"
-        raise errors.ParameterError(
-            f"method is {p.carving.method!r}; expected {expected} for {chosen} views"
-        )
+        raise errors.ParameterError(f"method is {p.carving.method!r}; expected {expected} for {chosen} views")
     run = read_run(bag)
     target = target_of_views(lambda: run.views(chosen), chosen, p.target)
     if target is None:

@@ -194,9 +194,7 @@ def _make(
     )
 
 
-def _make_ground(
-    factory: MessageFactory, stamp_ns: int, grid: GroundGrid, model: str, d: list[float]
-) -> Any:
+def _make_ground(factory: MessageFactory, stamp_ns: int, grid: GroundGrid, model: str, d: list[float]) -> Any:
     # A camera that looks straight down with north up: R turns y and z round, K is in pixels a metre.
     k = np.abs(grid.ground_to_pixel)
     k[:2, 2] = grid.ground_to_pixel[:2, 2]

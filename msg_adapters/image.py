@@ -253,7 +253,7 @@ def check_pixels(pixels: NDArray[Any], kind: ImageStream) -> None:
     """Refuse pixels that break the stream's rule.
 
     Coherent images must be finite. Views may hold NaN where they know nothing, never infinities;
-    amplitudes are not negative, likelihoods lie in [0, 1], masks hold 0, 255 and 128 (unknown). An image
+    amplitudes are not negative, likelihoods lie in [0, 1], masks hold 0, 64, 128 and 255. An image
     that holds only zeros, or a view that knows nothing at all, is no measurement.
 
     Raises
@@ -265,8 +265,9 @@ def check_pixels(pixels: NDArray[Any], kind: ImageStream) -> None:
     if content == "picture":
         return
     if content == "mask":
-        known = (pixels == 0) | (pixels == 255)
-        _refuse(~known & (pixels != 128), pixels, where, "none of 0, 128, 255", "0, 128 or 255")
+        _refuse(
+            ~np.isin(pixels, (0, 64, 128, 255)), pixels, where, "none of 0, 64, 128, 255", "0, 64, 128 or 255"
+        )
         return
     finite = np.isfinite(pixels)
     if content == "count":

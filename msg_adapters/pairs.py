@@ -69,9 +69,7 @@ def sector_from_msgs(image: Any, info: Any) -> Sector:
     return Sector(pixels, s.grid, s.acoustics, s.stamp_ns, s.aspect_rad, s.aperture_rad, s.carrier_rad_m)
 
 
-def sector_to_msgs(
-    factory: MessageFactory, sector: Sector, encoding: str | None = None
-) -> tuple[Any, Any]:
+def sector_to_msgs(factory: MessageFactory, sector: Sector, encoding: str | None = None) -> tuple[Any, Any]:
     """Make (Image, CameraInfo) of a sector."""
     return (
         image_to_msg(factory, sector.pixels, sector.stamp_ns, "sector", encoding),

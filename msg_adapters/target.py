@@ -72,9 +72,7 @@ def target_from_msg(msg: Any) -> TargetBox | None:
     where = "target"
     if not check_marker(msg, CUBE, "CUBE", where):
         return None
-    box = TargetBox(
-        xyz_of(msg.pose.position, f"{where}.pose.position"), xyz_of(msg.scale, f"{where}.scale")
-    )
+    box = TargetBox(xyz_of(msg.pose.position, f"{where}.pose.position"), xyz_of(msg.scale, f"{where}.scale"))
     if not min(box.size_m) > 0:
         raise AdapterError(f"{where}.scale is {box.size_m}; expected x, y, z > 0 m")
     return box

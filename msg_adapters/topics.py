@@ -149,7 +149,7 @@ STREAMS: dict[str, ImageStream] = {
             ("mono8",),
             CSAS_SHADOW,
             "mask",
-            "segmented target shadow: 255 shadow, 0 not, 128 unknown",
+            "segmented target shadow: 255 shadow, 0 not, 128 unknown, 64 covered",
         ),
         ImageStream(
             "multilook", ("32FC1",), CSAS_IMAGE, "amplitude", "multilook amplitude over the circle, north up"

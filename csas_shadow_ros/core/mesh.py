@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -88,6 +89,11 @@ class Dimensions:
         Direction of the length, counter-clockwise from +x, in [0, π).
     position_m : (float, float)
         Middle (x, y) of the rectangle.
+    hull_top_m : float
+        Top of the carved hull, whose cap no shadow can tell from a flat top; NaN where it was not told apart.
+    intervals : mapping of str to (float, float)
+        95 % interval of each measure by its name (``position_x_m`` and ``position_y_m`` for the position);
+        empty where there are none.
     """
 
     length_m: float
@@ -96,6 +102,8 @@ class Dimensions:
     volume_m3: float
     heading_rad: float
     position_m: tuple[float, float]
+    hull_top_m: float = math.nan
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def measure(mesh: trimesh.Trimesh) -> Dimensions:

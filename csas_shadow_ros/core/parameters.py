@@ -179,7 +179,10 @@ class CarvingParameters(Parameters):
         high=1.0,
     )
     min_views_fraction: float = bounded(
-        0.25, "a voxel seen by a smaller fraction of the views is unknown", low=0.0, high=1.0
+        0.25,
+        "a voxel seen by a smaller fraction of the views is unknown (consensus: object only on top of some)",
+        low=0.0,
+        high=1.0,
     )
 
     @property

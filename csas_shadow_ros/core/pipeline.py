@@ -21,7 +21,8 @@ from .composites import Composites
 from .errors import ViewError
 from .geometry import CoherentImage, Track, View
 from .likelihood import Levels, outside_likelihood, view_levels
-from .mesh import Dimensions, measure, mesh_from_grid
+from .measurement import SilhouetteSides, measure_object, silhouette_sides
+from .mesh import Dimensions, mesh_from_grid
 from .parameters import CarvingParameters, PipelineParameters
 from .segmentation import require_silhouette, segment_shadow
 from .shadow import enhance
@@ -42,6 +43,7 @@ class ProcessedView:
     levels: Levels
     likelihood: View
     mask: View
+    sides: SilhouetteSides | None
 
 
 @dataclass(eq=False)
@@ -66,6 +68,8 @@ class Result:
         Reason for each aspect (degrees) whose view was not used.
     levels : dict
         (σ_r, contrast, estimated) of each view, by stamp.
+    sides : list of SilhouetteSides
+        Where the shadow ends in each view: what the dimensions are measured on.
     timings_s : dict
         Seconds of wall time by step.
     """
@@ -80,6 +84,7 @@ class Result:
     views_used: int = 0
     rejected: dict[float, str] = field(default_factory=dict)
     levels: dict[int, tuple[float, float, bool]] = field(default_factory=dict)
+    sides: list[SilhouetteSides] = field(default_factory=list)
     timings_s: dict[str, float] = field(default_factory=dict)
 
 
@@ -94,7 +99,8 @@ def process_view(
     mask = segment_shadow(
         shadow, target.position_m, p.likelihood, levels, reach_m=target.reach_m
     )  # 4.1 silhouette
-    return ProcessedView(sub_aperture, shadow, levels, likelihood, mask)
+    sides = silhouette_sides(levels, mask, target.position_m)
+    return ProcessedView(sub_aperture, shadow, levels, likelihood, mask, sides)
 
 
 def run(
@@ -182,7 +188,7 @@ def run(
         result.grid, result.other_grid = (carver.grid() for carver in carvers)
         if result.grid.occupied.any():
             result.mesh = mesh_from_grid(result.grid)
-            result.dimensions = measure(result.mesh)
+            result.dimensions = measure_object(result.grid, result.mesh, result.sides)
     lap("shape")
     return result
 
@@ -214,6 +220,8 @@ def _integrate(result: Result, carvers: list[Carver], view: ProcessedView) -> No
             continue
         used |= integrated and carver is carvers[0]
     result.views_used += used
+    if used and view.sides is not None:
+        result.sides.append(view.sides)
     levels = view.levels
     result.levels[view.shadow.info.stamp_ns] = (levels.seabed_level, levels.contrast, levels.estimated)
 

@@ -1,8 +1,8 @@
 """Segment the target's shadow in a view, which the paper did by hand (section 4.1, figure 7).
 
 The silhouette that hard carving needs is everything that the target hides: its shadow, and its own
-echo laid over the near end of it. The shadow is found by contrast; echo, and whatever lies between it and
-the shadow at the target, is marked as "knows nothing" rather than guessed.
+echo laid over the near end of it. The shadow is found by contrast; echo is marked as "knows nothing", and
+whatever lies between it and the shadow as "covered": carving decides what it is once it knows the shape.
 """
 
 from __future__ import annotations
@@ -15,15 +15,19 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .carving import MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
+from .carving import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from .errors import ViewError
 from .geometry import View, ViewInfo
 from .likelihood import Levels, box_mean, echo_mask, view_levels
 from .parameters import LikelihoodParameters
 
-#: Shadow where the local mean power is under this fraction of the seabed's. At a straight edge, half of the
-#: box lies on seabed and the mean is 0.5; a little less balances the views that look past the edge.
-_DARK = 0.42
+#: Shadow where the local mean power is less than this far from the shadow's level to the seabed's. At a
+#: straight edge half of the box lies on seabed and the mean is 0.5 of the way. Less than that, as beside a
+#: flat side seen along it some looks of the aperture see past its near end, and others past its far end.
+_DARK = 0.37
+#: The box's half-size in resolution cells, down-range and across. A shadow is several times as long as
+#: the target is high: down-range, averaging costs little resolution in height.
+_HALF_CELLS = (1.8, 0.75)
 #: The averaging box reaches no farther than this (pixels).
 _MAX_RADIUS = 8
 #: The flank of a shadow without an echo before it (pixels).
@@ -40,13 +44,25 @@ def dark_pixels(levels: Levels, info: ViewInfo) -> NDArray[np.bool_]:
     levels : Levels
         The view relative to its seabed level.
     info : ViewInfo
-        Its resolution: the mean is taken over about two cells either way, enough looks to tell a
-        shadow from a dark speckle.
+        Its resolution sets the box that the mean is taken over.
     """
-    cells = zip(info.resolution_m, info.camera.spacing_m, strict=True)
-    rows, cols = (int(min(max(round(cell / pixel), 1), _MAX_RADIUS)) for cell, pixel in cells)
+    cells = zip(_HALF_CELLS, info.resolution_m, info.camera.spacing_m, strict=True)
+    rows, cols = (int(min(max(round(half * cell / pixel), 1), _MAX_RADIUS)) for half, cell, pixel in cells)
     power = box_mean(levels.power, levels.known, (rows, cols))
-    return (power < max(_DARK, 1.0 / levels.contrast)) & levels.known
+    shadow_power = 1.0 / levels.contrast**2
+    dark = power < np.float32(shadow_power + _DARK * (1.0 - shadow_power))
+    # A threshold below one half draws a straight edge across the box in by a known part of it: the far end
+    # of the shadow, which tells the height, is put back.
+    dark = _drawn_down(dark, round((0.5 - _DARK) * (2 * rows + 1)))
+    return np.asarray(dark & levels.known)
+
+
+def _drawn_down(dark: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:
+    """Extend dark pixels down-range by some rows."""
+    out = dark.copy()
+    for shift in range(1, rows + 1):
+        out[shift:] |= dark[:-shift]
+    return out
 
 
 def segment_shadow(
@@ -75,8 +91,8 @@ def segment_shadow(
     Returns
     -------
     View
-        uint8: 255 target's shadow, 0 outside, 128 where the view knows nothing: off the image, in an echo,
-        and between the target's echo and its shadow.
+        uint8: 255 target's shadow, 0 outside, 128 where the view knows nothing (off the image, and in an
+        echo), 64 between the target's echo and its shadow: the target covers it, or is open below.
 
     Raises
     ------
@@ -89,7 +105,8 @@ def segment_shadow(
     mask = np.full(levels.known.shape, MASK_OUTSIDE, np.uint8)
     if p.echo_unknown:
         echo = echo_mask(levels.power, levels.known, p.echo_db)
-        mask[_before_shadow(shadow, echo) | echo] = MASK_UNKNOWN
+        mask[_before_shadow(shadow, echo)] = MASK_COVERED
+        mask[echo] = MASK_UNKNOWN
     mask[shadow] = MASK_SHADOW
     mask[~levels.known] = MASK_UNKNOWN
     return replace(view, pixels=mask)

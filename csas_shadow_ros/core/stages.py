@@ -16,7 +16,8 @@ from .carving import Carver
 from .errors import NoTargetError, ParameterError, ViewError
 from .geometry import TWO_PI, View, fit_target_to_focus, wrap_angle
 from .likelihood import Levels, outside_likelihood, view_levels
-from .mesh import measure, mesh_from_grid
+from .measurement import SilhouetteSides, levels_of_mask, measure_object, silhouette_sides
+from .mesh import mesh_from_grid
 from .parameters import PipelineParameters, ShadowParameters, TargetParameters
 from .pipeline import Result, compose, in_order
 from .segmentation import require_silhouette, segment_shadow
@@ -39,6 +40,7 @@ class StagedView:
     levels: Levels | None = None
     likelihood: View | None = None
     mask: View | None = None
+    sides: SilhouetteSides | None = None
 
 
 def spread_views(views: Iterable[View], count: int, start_rad: float = 0.0) -> list[View]:
@@ -127,13 +129,14 @@ def stage_view(view: View, stage: str, target: Target, p: PipelineParameters) ->
     if stage == "likelihood":
         return StagedView(likelihood=view)
     if stage == "shadow_mask":
-        return StagedView(mask=view)
+        return StagedView(mask=view, sides=silhouette_sides(levels_of_mask(view), view, target.position_m))
     sub_aperture = view if stage == "sub_aperture" else None
     shadow = enhance(view, target.position_m, p.shadow) if sub_aperture is not None else view  # 3.2
     levels = view_levels(shadow, p.likelihood)  # 4.2
     likelihood = outside_likelihood(shadow, p.likelihood, levels)
     mask = segment_shadow(shadow, target.position_m, p.likelihood, levels, reach_m=target.reach_m)  # 4.1
-    return StagedView(sub_aperture, shadow, levels, likelihood, mask)
+    sides = silhouette_sides(levels, mask, target.position_m)
+    return StagedView(sub_aperture, shadow, levels, likelihood, mask, sides)
 
 
 def run_views(
@@ -228,7 +231,7 @@ def run_views(
         result.grid, result.other_grid = grids[0], grids[1] if len(grids) > 1 else None
         if result.grid.occupied.any():
             result.mesh = mesh_from_grid(result.grid)
-            result.dimensions = measure(result.mesh)
+            result.dimensions = measure_object(result.grid, result.mesh, result.sides)
     lap("shape")
     return result
 
@@ -258,6 +261,8 @@ def _integrate(result: Result, carvers: list[Carver], staged: StagedView, view: 
             continue
         if carver is carvers[0]:
             result.views_used += integrated
+            if integrated and staged.sides is not None:
+                result.sides.append(staged.sides)
     if staged.levels is not None:
         levels = staged.levels
         stamp = view.info.stamp_ns

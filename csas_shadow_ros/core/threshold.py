@@ -14,10 +14,12 @@ from .volume import Volume, VoxelGrid
 #: Soft: where the threshold lies between the darkest voxels (0) and the brightest (1) of the volume. A
 #: voxel just outside the object is bright in some views only: those that look past the object's side.
 _SOFT_LEVEL = 0.115
-#: Consensus: a voxel is removed when more than this fraction of its views contradict it. A voxel 2 cm off the
-#: middle of a flat side of 0.8 m is seen to be free from 3 % of the circle; less tolerance loses shadows that
-#: cross clutter, more leaves a skirt round flat sides.
-_CONSENSUS = 0.04
+#: Consensus: a voxel is removed when more than this fraction of its views contradict it. A voxel 2 cm off
+#: the middle of a flat side of 0.8 m is seen to be free from 3 % of the circle; less tolerance loses voxels
+#: to bad silhouettes, more leaves a skirt round flat sides.
+_CONSENSUS = 0.03
+#: Consensus: a voxel that a smaller fraction of the views knows is unknown.
+_LEAST_VIEWS = 0.04
 #: Hard: any contradiction removes; the least one, 1 of 65535 views, is above this.
 _HARD = 1e-5
 #: Soft: a voxel under the object is part of it unless its likelihood is over this. Masks say "unknown"
@@ -84,7 +86,23 @@ def supported(dark: NDArray[np.bool_], likelihood: NDArray[np.float32], limit: f
     return out
 
 
-def occupied_voxels(likelihood: NDArray[np.float32], threshold: float, method: str) -> NDArray[np.bool_]:
+def least_views_fraction(parameters: CarvingParameters) -> float:
+    """Return the fraction of the views that must know a voxel for it to have a likelihood at all.
+
+    By silhouettes, a few views can tell that a voxel is *not* object. What they cannot do alone is to
+    say that it is: see `occupied_voxels`.
+    """
+    if parameters.method == "consensus":
+        return min(parameters.min_views_fraction, _LEAST_VIEWS)
+    return parameters.min_views_fraction
+
+
+def occupied_voxels(
+    likelihood: NDArray[np.float32],
+    threshold: float,
+    method: str,
+    well_seen: NDArray[np.bool_] | None = None,
+) -> NDArray[np.bool_]:
     """Return the object's voxels: under the threshold, supported, without stray pieces.
 
     A few voxels alone are no object: the smallest is 27 voxels in one piece.
@@ -97,12 +115,22 @@ def occupied_voxels(likelihood: NDArray[np.float32], threshold: float, method: s
         NaN for no object.
     method : {'consensus', 'hard', 'soft'}
         How it was carved.
+    well_seen : ndarray of bool, shape (nz, ny, nx), optional
+        Voxels that enough views know. One that fewer know, as its shadow leaves the image in most views, is
+        object only where it stands on the object: high tops stay, phantom roofs do not.
     """
     if math.isnan(threshold):
         return np.zeros(likelihood.shape, bool)
     with np.errstate(invalid="ignore"):
         dark = likelihood < threshold
-    body = supported(dark, likelihood, max(_SOFT_SUPPORT, threshold) if method == "soft" else threshold)
+    limit = max(_SOFT_SUPPORT, threshold) if method == "soft" else threshold
+    if well_seen is None:
+        body = supported(dark, likelihood, limit)
+    else:
+        known = np.where(well_seen, likelihood, np.float32(np.nan))
+        body = supported(dark & well_seen, known, limit)
+        for k in range(1, body.shape[0]):
+            body[k] |= dark[k] & ~well_seen[k] & body[k - 1]
     labels, count = scipy.ndimage.label(body, np.ones((3, 3, 3), bool))
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     sizes[0] = 0
@@ -132,5 +160,8 @@ def thresholded(
     """
     method = parameters.method
     threshold = parameters.threshold or object_threshold(likelihood, method)
-    occupied = occupied_voxels(likelihood, threshold, method)
+    well_seen = None
+    if method == "consensus":
+        well_seen = views >= max(1, math.ceil(parameters.min_views_fraction * int(views.max(initial=0))))
+    occupied = occupied_voxels(likelihood, threshold, method, well_seen)
     return VoxelGrid(volume, likelihood, views, threshold, occupied, method)

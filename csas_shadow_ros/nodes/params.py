@@ -274,9 +274,7 @@ def parameter_table() -> str:
         lines += [f"**{name}**", "", "| parameter | default | range | meaning |", "|---|---|---|---|"]
         for field in dataclasses.fields(kind):
             default = _yaml_value(field.default).replace('""', '"" (must be given)')
-            lines.append(
-                f"| `{field.name}` | {default} | {expected_of(field)} | {description_of(field)} |"
-            )
+            lines.append(f"| `{field.name}` | {default} | {expected_of(field)} | {description_of(field)} |")
         lines.append("")
     return "\n".join(lines).rstrip() + "\n"
 

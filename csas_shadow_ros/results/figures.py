@@ -24,7 +24,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
-from ..core.carving import MASK_SHADOW, MASK_UNKNOWN
+from ..core.carving import MASK_COVERED, MASK_SHADOW, MASK_UNKNOWN
 from ..core.errors import CsasError
 from ..core.geometry import (
     TWO_PI,
@@ -511,14 +511,20 @@ def figure_7(subject: Subject) -> Figure:
     a.set_ylabel("down-range from the target (m)")
     _scale_bar(a, _round_length(right - left))
     figure.colorbar(shown, ax=a, label="level over the median (dB)", shrink=0.85)
-    colours = {"outside": (0.85, 0.85, 0.85), "knows nothing": (0.55, 0.65, 0.85), "shadow": (0.0, 0.0, 0.0)}
+    colours = {
+        "outside": (0.85, 0.85, 0.85),
+        "knows nothing": (0.55, 0.65, 0.85),
+        "covered, or open below": (0.9, 0.75, 0.45),
+        "shadow": (0.0, 0.0, 0.0),
+    }
     picture = np.empty((*mask.pixels.shape, 3))
     picture[:] = colours["outside"]
     picture[mask.pixels == MASK_UNKNOWN] = colours["knows nothing"]
+    picture[mask.pixels == MASK_COVERED] = colours["covered, or open below"]
     picture[mask.pixels == MASK_SHADOW] = colours["shadow"]
     _show_view(b, subject, mask, picture, "(b) segmented automatically")
     handles = [Patch(facecolor=c, edgecolor="0.3", label=n) for n, c in colours.items()]
-    figure.legend(handles=handles, loc="outside lower right", ncols=3, frameon=False)
+    figure.legend(handles=handles, loc="outside lower right", ncols=4, frameon=False)
     figure.suptitle(f"Segmentation of the shadow at θ₀ = {_degrees(shadow):.0f}° (the sonar is above)")
     return figure
 

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bags import BagReader, Run, read_run
-from ..core.carving import Carver
+from ..core.carving import Carver, KeptMask
 from ..core.errors import ViewError
 from ..core.geometry import GroundGrid, View
 from ..core.likelihood import view_levels
+from ..core.measurement import levels_of_mask, measure_object, silhouette_sides
 from ..core.parameters import PipelineParameters
 from ..core.pipeline import Result
 from ..core.segmentation import require_silhouette
@@ -28,11 +29,12 @@ from .folder import ResultsWriter
 if TYPE_CHECKING:
     from ..replay import ReplayResult
 
+#: Masks before the views that they were segmented in.
 _STAGES = {
     "sub_aperture": "sub_aperture",
+    "shadow_mask": "mask",
     "shadow": "shadow",
     "likelihood": "likelihood",
-    "shadow_mask": "mask",
 }
 
 
@@ -107,6 +109,7 @@ def _adopt_views(writer: ResultsWriter, run: Run, result: Result, p: PipelinePar
     if result.grid is None:
         return
     held = [stage for stage in _STAGES if run.counts.get(stage)]
+    masks: dict[int, KeptMask] = {}
     other = Carver(result.grid.volume, p.carving.other())
     wanted = "shadow_mask" if other.parameters.takes_masks else "likelihood"
     shown: dict[int, dict[str, View]] = {}
@@ -123,18 +126,39 @@ def _adopt_views(writer: ResultsWriter, run: Run, result: Result, p: PipelinePar
             try:
                 if stage == wanted:
                     other.integrate(require_silhouette(view) if stage == "shadow_mask" else view)
+                if stage == "shadow_mask":
+                    masks[stamp] = KeptMask.of(view)
                 if stage == "shadow":
                     levels = view_levels(view, p.likelihood)
                     result.levels[stamp] = (levels.seabed_level, levels.contrast, levels.estimated)
+                    if result.target is not None and stamp in masks:
+                        mask = masks.pop(stamp).view()
+                        sides = silhouette_sides(levels, mask, result.target.position_m)
+                        result.sides += [sides] if sides is not None else []
             except ViewError:
                 continue  # named by the node that refused it
             writer.note_view(view)
     for stages in shown.values():
         shadow = stages.get("shadow")
         levels_of = view_levels(shadow, p.likelihood) if shadow is not None else None
-        writer.show_view(StagedView(levels=levels_of, **stages))
+        writer.show_view(
+            StagedView(
+                stages.get("sub_aperture"),
+                shadow,
+                levels_of,
+                stages.get("likelihood"),
+                stages.get("mask"),
+            )
+        )
     if other.stamps:
         result.other_grid = other.grid()
+    if result.target is not None:
+        for kept in masks.values():  # silhouettes that came without the views that they are of
+            mask = kept.view()
+            sides = silhouette_sides(levels_of_mask(mask), mask, result.target.position_m)
+            result.sides += [sides] if sides is not None else []
+    if result.mesh is not None:
+        result.dimensions = measure_object(result.grid, result.mesh, result.sides)
 
 
 def node_table(replayed: ReplayResult) -> dict[str, Any]:

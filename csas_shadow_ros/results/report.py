@@ -18,9 +18,11 @@ import numpy as np
 
 from .. import __version__
 from ..core.geometry import CoherentImage, Track
+from ..core.measurement import shadow_height
 from ..core.mesh import Dimensions
-from ..core.parameters import PipelineParameters
+from ..core.parameters import CarvingParameters, PipelineParameters
 from ..core.pipeline import Result
+from ..core.threshold import thresholded
 from ..core.volume import VoxelGrid
 from .truth import KnownTruth
 
@@ -126,6 +128,51 @@ def _grid(grid: VoxelGrid | None) -> dict[str, Any] | None:
     }
 
 
+#: Thresholds that the sensitivity curve is made at, as multiples of the one that was used.
+_SENSITIVITY = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
+
+
+def _sensitivity(grid: VoxelGrid | None, parameters: CarvingParameters) -> list[dict[str, float]]:
+    """Say how the object changes with the threshold: the curve is flat where the threshold hardly matters."""
+    if grid is None or not math.isfinite(grid.threshold):
+        return []
+    curve = []
+    for factor in _SENSITIVITY:
+        threshold = min(1.0, factor * grid.threshold)
+        chosen = dataclasses.replace(parameters, method=grid.method, threshold=threshold)
+        occupied = thresholded(grid.volume, grid.likelihood, grid.views, chosen).occupied
+        layers = np.flatnonzero(occupied.any(axis=(1, 2)))
+        d = grid.volume.voxel_size_m
+        curve.append(
+            {
+                "threshold": threshold,
+                "volume_m3": float(np.count_nonzero(occupied)) * d**3,
+                "plan_m2": float(np.count_nonzero(occupied.any(axis=0))) * d**2,
+                "top_m": float(grid.volume.z_m[layers[-1]] + d / 2) if len(layers) else 0.0,
+            }
+        )
+    return curve
+
+
+def _shadow_heights(result: Result) -> dict[str, Any] | None:
+    """Return the height that each view's shadow length implies."""
+    if result.dimensions is None or not result.sides:
+        return None
+    heights = [(side.info, shadow_height(side, result.dimensions)) for side in result.sides]
+    return {
+        "formula": "z = s_z (tip - top) / (s + tip), down-range from the origin; top: far side of the plan",
+        "median_m": float(np.median([height for _, height in heights])),
+        "by_view": [
+            {
+                "aspect_deg": math.degrees(info.aspect_rad) % 360.0,
+                "stamp_ns": info.stamp_ns,
+                "height_m": height,
+            }
+            for info, height in sorted(heights, key=lambda pair: pair[0].stamp_ns)
+        ],
+    }
+
+
 def _levels(
     levels: Mapping[int, tuple[float, float, bool]], aspects_deg: Mapping[int, float]
 ) -> dict[str, Any]:
@@ -219,6 +266,8 @@ def build_report(
         "method": context.parameters.carving.method,
         "dimensions": _dimensions(result.dimensions),
         "threshold": result.grid.threshold if result.grid is not None else None,
+        "sensitivity": _sensitivity(result.grid, context.parameters.carving),
+        "shadow_heights": _shadow_heights(result),
         "target": result.target,
         "grid": _grid(result.grid),
         "other_method": {"grid": _grid(result.other_grid), "dimensions": _dimensions(other)},
@@ -285,7 +334,9 @@ def summary(report: Mapping[str, Any]) -> str:
     elif truth and bool(mine) != truth["object"]:
         lines[0] += " (in truth there is one)" if truth["object"] else " (in truth there is none)"
     if mine or true:
-        lines.append(f"{'':<14}{'found':>12}" + (f"{'truth':>12}{'difference':>12}" if true else ""))
+        intervals = mine.get("intervals") or {}
+        sure = f"{'95 %':>12}" if intervals else ""
+        lines.append(f"{'':<14}{'found':>12}{sure}" + (f"{'truth':>12}{'difference':>12}" if true else ""))
         rows = (
             ("length", "length_m", "m"),
             ("width", "width_m", "m"),
@@ -301,6 +352,11 @@ def summary(report: Mapping[str, Any]) -> str:
             cells = [f"{round(value, digits) + 0.0:.{digits}f} {unit}" for value in values]  # no -0
             if not mine:
                 cells.insert(0, "-")
+            if intervals:
+                name = {0: "position_x_m", 1: "position_y_m", "heading_deg": "heading_rad"}.get(key, key)
+                low, high = intervals.get(name, (math.nan, math.nan))
+                half = (high - low) / 2.0 * (180.0 / math.pi if name == "heading_rad" else 1.0)
+                cells.insert(1, f"± {half:.{digits}f} {unit}")
             line = f"{label:<14}" + "".join(f"{cell:>12}" for cell in cells)
             if mine and true:
                 off = values[0] - values[1]

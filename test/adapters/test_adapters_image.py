@@ -215,7 +215,7 @@ BAD_PIXELS = [
     ("likelihood", 1.001, r"likelihood/image has 1 of 35 pixels outside \[0, 1\].*1\.001"),
     ("likelihood", -0.25, r"likelihood/image has 1 of 35 pixels outside \[0, 1\]"),
     ("likelihood", -np.inf, r"likelihood/image has 1 of 35 pixels infinite"),
-    ("shadow_mask", 1, r"shadow_mask/image has 1 of 35 pixels none of 0, 128, 255.*\(1\)"),
+    ("shadow_mask", 1, r"shadow_mask/image has 1 of 35 pixels none of 0, 64, 128, 255.*\(1\)"),
     ("voxel_views", -1.0, r"voxel_views/image has 4 of 140 pixels not counts.*row 2, column 3, channel 0"),
     ("voxel_grid", 2.0, r"voxel_grid/image has 4 of 140 pixels outside.*row 2, column 3, channel 0"),
 ]

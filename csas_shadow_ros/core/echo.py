@@ -1,0 +1,162 @@
+"""Where a carved body can echo: the pixels of a view that its own echo may cover.
+
+A scatterer at (x, y, z) is imaged at (x, y) + z tan ψ û(θ), towards the sonar. The target's echo therefore
+lies over seabed that it hides or that lies before it, and a lit pixel there does not say that the seabed
+is free. Which pixels these are follows from the shape: what can be seen of it from the sonar, laid over. Lit
+pixels elsewhere are seabed, also those under an overhang, between the echo and the shadow.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from .geometry import ViewInfo
+from .volume import Volume
+
+BoolArray = NDArray[np.bool_]
+
+#: An echo may show so many resolution cells beyond the voxel that it comes from, down-range and across:
+#: strong echoes have sidelobes, and sound that bounced twice arrives late.
+_RESPONSE_CELLS = (4.5, 4.0)
+
+
+def opaque_part(occupied: BoolArray, grazing_rad: float, slack_voxels: float = 1.0) -> BoolArray:
+    """Return the voxels of a carved body that surely block the view, whatever its true top is like.
+
+    Shadows do not tell a flat top from one that rises towards its middle at less than the grazing angle:
+    carving leaves that cap standing. A voxel under the top by less than the cap may be free in truth.
+
+    Parameters
+    ----------
+    occupied : ndarray of bool, shape (nz, ny, nx)
+        Carved body.
+    grazing_rad : float
+        ψ.
+    slack_voxels : float
+        Added to the cap's thickness, which is tan ψ times the distance from the layer's edge.
+    """
+    opaque = np.zeros_like(occupied)
+    covered = np.zeros(occupied.shape[1:], np.float32)
+    tan_grazing = math.tan(grazing_rad)
+    for k in range(occupied.shape[0] - 1, -1, -1):
+        covered = np.where(occupied[k], covered + 1, 0).astype(np.float32)
+        if occupied[k].any():
+            inside = scipy.ndimage.distance_transform_edt(occupied[k])
+            opaque[k] = occupied[k] & (covered - 1 > tan_grazing * inside + slack_voxels)
+    return opaque
+
+
+@numba.njit(cache=True, nogil=True)
+def _unhidden(
+    opaque: BoolArray, i: float, j: float, k: float, di: float, dj: float, dk: float
+) -> bool:  # pragma: no cover
+    """Walk from a point (voxel indices) towards the sonar; False if an opaque voxel is in the way."""
+    nz, ny, nx = opaque.shape
+    while True:
+        a, b, c = math.floor(i + 0.5), math.floor(j + 0.5), math.floor(k + 0.5)
+        if a < 0 or b < 0 or a >= nx or b >= ny or c >= nz:
+            return True
+        if c >= 0 and opaque[c, b, a]:
+            return False
+        i += di
+        j += dj
+        k += dk
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark_echoes(
+    occupied: BoolArray,
+    opaque: BoolArray,
+    origin: NDArray[np.float64],
+    step: float,
+    sonar: NDArray[np.float64],
+    layover: NDArray[np.float64],
+    affine: NDArray[np.float64],
+    reach: NDArray[np.int64],
+    out: BoolArray,
+) -> None:  # pragma: no cover
+    nz, ny, nx = occupied.shape
+    rows, cols = out.shape
+    face = 0.52  # just outside a voxel
+    for k in range(nz):
+        for j in range(ny):
+            for i in range(nx):
+                if not occupied[k, j, i]:
+                    continue
+                x, y, z = origin[0] + i * step, origin[1] + j * step, origin[2] + k * step
+                di, dj, dk = sonar[0] - x, sonar[1] - y, sonar[2] - z
+                length = 2.0 * max(abs(di), abs(dj), abs(dk))  # half a voxel a step
+                di, dj, dk = di / length, dj / length, dk / length
+                if not opaque[k, j, i]:
+                    seen = _unhidden(opaque, i, j, k, di, dj, dk)
+                else:
+                    seen = False
+                    if k + 1 >= nz or not opaque[k + 1, j, i]:
+                        seen = _unhidden(opaque, i, j, k + face, di, dj, dk)
+                    a = 1 if di > 0 else -1
+                    if not seen and (i + a < 0 or i + a >= nx or not opaque[k, j, i + a]):
+                        seen = _unhidden(opaque, i + face * a, j, k, di, dj, dk)
+                    a = 1 if dj > 0 else -1
+                    if not seen and (j + a < 0 or j + a >= ny or not opaque[k, j + a, i]):
+                        seen = _unhidden(opaque, i, j + face * a, k, di, dj, dk)
+                if not seen:
+                    continue
+                px, py = x + z * layover[0], y + z * layover[1]
+                u = math.floor(affine[0, 0] * px + affine[0, 1] * py + affine[0, 2] + 0.5)
+                v = math.floor(affine[1, 0] * px + affine[1, 1] * py + affine[1, 2] + 0.5)
+                for b in range(max(0, v - reach[0]), min(rows, v + reach[0] + 1)):
+                    for a in range(max(0, u - reach[1]), min(cols, u + reach[1] + 1)):
+                        out[b, a] = True
+
+
+def echo_zone(info: ViewInfo, volume: Volume, occupied: BoolArray, opaque: BoolArray) -> BoolArray:
+    """Mark the pixels of a view that the echo of a carved body may cover.
+
+    Parameters
+    ----------
+    info : ViewInfo
+        The view.
+    volume : Volume
+        Lattice of the body.
+    occupied : ndarray of bool, shape (nz, ny, nx)
+        Where there may be matter.
+    opaque : ndarray of bool, shape (nz, ny, nx)
+        What surely hides what is behind it (`opaque_part`).
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+
+    Notes
+    -----
+    Layover: (x, y) + z tan ψ û(θ).
+    """
+    camera = info.camera
+    out = np.zeros(camera.shape, np.bool_)
+    half = volume.voxel_size_m / 2.0
+    reach = np.array(
+        [
+            math.ceil((half + cells * cell) / spacing)
+            for cells, cell, spacing in zip(_RESPONSE_CELLS, info.resolution_m, camera.spacing_m, strict=True)
+        ],
+        np.int64,
+    )
+    tan_grazing = math.tan(camera.grazing_rad)
+    layover = tan_grazing * np.array([math.cos(info.aspect_rad), math.sin(info.aspect_rad)])
+    _mark_echoes(
+        occupied,
+        opaque,
+        np.asarray(volume.origin_m, dtype=np.float64),
+        volume.voxel_size_m,
+        np.asarray(camera.sonar_m, dtype=np.float64),
+        layover,
+        np.ascontiguousarray(camera.ground_to_pixel[:2]),
+        reach,
+        out,
+    )
+    return out

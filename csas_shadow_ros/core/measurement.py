@@ -1,0 +1,463 @@
+"""How large is the object, and how sure is that?
+
+Length, width, heading and position come from the sides of the silhouettes, not from the voxels. Seen from
+aspect θ, the shadow ends to either side where the target's plan does: at the plan's support h in the
+directions e_c(θ) and -e_c(θ). All looks of the aperture add up in a view, each with its own edge, so that the
+edge's mean place is the mean of h over the aperture,
+
+    h̄(φ) = 1/w ∫ h(φ + α) dα,   |α| < w/2,
+
+and beside a flat side seen along it, lies outside of it. A plan is convex to its shadows: h + h'' ≥ 0. The
+least-squares h under that condition undoes the mean over the aperture.
+
+The height comes from the carved layers. Shadows cannot tell a flat top from one that rises towards the middle
+at up to the grazing angle, and carving leaves that cap: the height is where the cap begins.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import scipy.ndimage
+import trimesh
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from .carving import MASK_SHADOW, MASK_UNKNOWN
+from .geometry import TWO_PI, View, ViewInfo, cross_range_axis, down_range_axis
+from .likelihood import Levels
+from .mesh import Dimensions, measure
+from .volume import VoxelGrid
+
+FloatArray = NDArray[np.float64]
+
+#: Rows of a silhouette's side whose edge is so many pixels from the outermost take part.
+_SIDE_PX = 5.0
+#: Columns on either side of the edge that its mean place is taken from.
+_HALF_PX = 6
+#: A side that is drawn in by less than this over its rows is straight along range (pixels).
+_TAPER_PX = 2.5
+#: A side whose middle stands out by more than this is round (pixels).
+_BULGE_PX = 0.8
+#: Fewer rows than this give no edge.
+_MIN_ROWS = 8
+#: Directions of the plan, and looks over an aperture.
+_DIRECTIONS, _LOOKS = 120, 9
+#: The carved voxels stand in for sides that no view shows; beside an edge that is seen they count so much.
+_VOXEL_WEIGHT = 0.1
+#: A side that stands out of the carved voxels by more than this (cross-range cells) belongs to something else
+#: whose shadow touches the target's.
+_FOREIGN_CELLS = 3.0
+#: Fewer edges than this give no plan: the voxels alone are measured then.
+_MIN_EDGES = 24
+#: Resamplings of the views.
+_RESAMPLINGS = 30
+#: Error of one extent besides what resampling shows (1σ), in cross-range cells: edges are found to a fraction
+#: of one.
+_EDGE_CELLS = 0.5
+#: Where the cap begins: the mean of these two, voxels under the cap's top.
+_CAP_SLACK = (0.25, 0.5)
+_SIGMAS_95 = 1.96
+#: A drawn silhouette has no levels of its own.
+_DRAWN_CONTRAST = 1e3
+
+
+@dataclass(frozen=True)
+class SilhouetteSides:
+    """Where the target's shadow ends in one view.
+
+    Parameters
+    ----------
+    info : ViewInfo
+        The view.
+    direction_rad : tuple of float
+        Directions φ on the ground of the sides that were found, none to two.
+    support_m : tuple of float
+        The plan's support in these directions, mean over the aperture: the largest p · (cos φ, sin φ), m.
+    tip_m : float
+        Down-range e_r · p of the shadow's far end, m.
+    """
+
+    info: ViewInfo
+    direction_rad: tuple[float, ...]
+    support_m: tuple[float, ...]
+    tip_m: float
+
+
+def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) -> SilhouetteSides | None:
+    """Find where a view's shadow ends to both sides, to a fraction of a pixel.
+
+    Parameters
+    ----------
+    levels : Levels
+        The view relative to its seabed.
+    mask : View
+        Its segmented shadow.
+    target_m : (float, float)
+        Ground position of the target.
+
+    Returns
+    -------
+    SilhouetteSides or None
+        None if no shadow was segmented.
+    """
+    shadow = _largest_piece(mask.pixels == MASK_SHADOW)
+    if shadow is None:
+        return None
+    info = mask.info
+    camera = info.camera
+    rows = np.flatnonzero(shadow.any(axis=1))
+    sonar_range = math.hypot(camera.sonar_m[0] - target_m[0], camera.sonar_m[1] - target_m[1])
+    u0, v0, _ = camera.ground_to_pixel @ np.array([target_m[0], target_m[1], 1.0])
+    row_m, col_m = camera.spacing_m
+    # Rays fan out from the sonar: seen at the target's range, the shadow behind it is narrower.
+    scale = sonar_range / (sonar_range + (rows - v0) * row_m)
+    cols = shadow.shape[1]
+    first = shadow[rows].argmax(axis=1).astype(np.float64)
+    last = cols - 1 - shadow[rows][:, ::-1].argmax(axis=1).astype(np.float64)
+    e_c = cross_range_axis(info.aspect_rad)
+    directions, supports = [], []
+    for sign, edge in ((1, last), (-1, first)):
+        out = _side(levels, rows, sign * (edge - u0) * scale, scale, sign, u0)
+        if out is None:
+            continue
+        axis = sign * e_c
+        directions.append(math.atan2(axis[1], axis[0]))
+        supports.append(float(out * col_m + axis @ np.asarray(target_m)))
+    tip = info.down_range_of_rows()[rows[-1]] + row_m / 2.0
+    return SilhouetteSides(info, tuple(directions), tuple(supports), float(tip))
+
+
+def levels_of_mask(mask: View) -> Levels:
+    """Stand in for the levels of a view of which only the silhouette is there, such as one drawn by hand."""
+    known = mask.pixels != MASK_UNKNOWN
+    power = (known & (mask.pixels != MASK_SHADOW)).astype(np.float32)
+    return Levels(math.nan, _DRAWN_CONTRAST, math.nan, False, power, np.asarray(known))
+
+
+def _largest_piece(shadow: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(shadow.view(np.uint8), connectivity=8)
+    if count < 2:
+        return None
+    return np.asarray(labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()))
+
+
+def _side(
+    levels: Levels, rows: NDArray[np.intp], out_px: FloatArray, scale: FloatArray, sign: int, u0: float
+) -> float | None:
+    """Return how far out a side reaches (pixels from column u0, at the target's range), or None."""
+    kept = np.abs(out_px - np.percentile(out_px, 90)) <= _SIDE_PX
+    if kept.sum() < _MIN_ROWS:
+        return None
+    rows, out_px, scale = rows[kept], out_px[kept], scale[kept]
+    along = rows - rows.mean()
+    curve, straight = _fitted_side(along, out_px)
+    # The mean profile across the edge, rows laid over one another along the fitted side.
+    steps = np.arange(-_HALF_PX, _HALF_PX + 1)
+    columns = np.round(u0 + sign * (curve[:, None] + steps) / scale[:, None]).astype(np.intp)
+    inside = (columns >= 0) & (columns < levels.power.shape[1])
+    offsets = sign * (columns - u0) * scale[:, None] - curve[:, None]
+    columns = np.clip(columns, 0, levels.power.shape[1] - 1)
+    known = levels.known[rows[:, None], columns] & inside
+    if not known.any(axis=0).all():
+        return None
+    power = np.where(known, levels.power[rows[:, None], columns], 0.0).sum(axis=0) / known.sum(axis=0)
+    shadow_power = 1.0 / levels.contrast**2
+    dark = np.clip((1.0 - power) / (1.0 - shadow_power), -0.5, 1.2)
+    edge = -_HALF_PX - 0.5 + float(dark.sum()) + float((offsets - steps).mean())
+    return (float(curve[0]) if straight else float(curve.max())) + edge
+
+
+def _fitted_side(along: FloatArray, out_px: FloatArray) -> tuple[FloatArray, bool]:
+    """Fit a side: straight along range, else tapering, else round; say whether it is straight."""
+    weight = np.ones_like(out_px)
+    slope = level = 0.0
+    for _ in range(5):
+        middle, level = np.average(along, weights=weight), float(np.average(out_px, weights=weight))
+        spread = float((weight * (along - middle) ** 2).sum())
+        slope = float((weight * (along - middle) * (out_px - level)).sum()) / max(spread, 1e-9)
+        level -= slope * float(middle)
+        residual = np.abs(out_px - level - slope * along)
+        weight = 1.0 / np.maximum(1.0, residual / (1.5 * (1.4826 * float(np.median(residual)) + 0.3)))
+    mean = float(np.average(out_px, weights=weight))
+    reach = max(float(np.abs(along).max()), 1.0)
+    design = np.stack([np.ones_like(along), along / reach, (along / reach) ** 2], axis=1)
+    bend, *_ = np.linalg.lstsq(design * weight[:, None], out_px * weight, rcond=None)
+    curve = design @ bend
+    if bend[2] < 0.0 and float(curve.max()) - mean > _BULGE_PX:
+        return np.asarray(curve), False
+    if abs(slope) * float(np.ptp(along)) >= _TAPER_PX:
+        return np.asarray(level + slope * along), False
+    return np.full_like(out_px, mean), True
+
+
+class PlanFit:
+    """Least-squares support function of a plan from the sides of silhouettes.
+
+    Parameters
+    ----------
+    sides : sequence of SilhouetteSides
+        Of all views.
+    grid : VoxelGrid
+        Carved voxels, which stand in where no side is seen.
+    """
+
+    def __init__(self, sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> None:
+        pairs = [
+            (phi, support, side.info.aperture_rad, index)
+            for index, side in enumerate(sides)
+            for phi, support in zip(side.direction_rad, side.support_m, strict=True)
+        ]
+        seen = np.array(pairs, dtype=np.float64).reshape(-1, 4)
+        self.directions: FloatArray = np.arange(_DIRECTIONS, dtype=np.float64) * (TWO_PI / _DIRECTIONS)
+        own = _voxel_support(grid, self.directions)
+        if len(seen):
+            cell = float(np.median([side.info.resolution_m[1] for side in sides]))
+            margin = _FOREIGN_CELLS * cell + grid.volume.voxel_size_m
+            expected = np.interp(seen[:, 0] % TWO_PI, self.directions, own, period=TWO_PI)
+            seen = seen[np.abs(seen[:, 1] - expected) <= margin]
+        self.count = len(seen)
+        self.centre = 2.0 * np.array(
+            [np.mean(own * np.cos(self.directions)), np.mean(own * np.sin(self.directions))]
+        )
+        phi = np.concatenate([seen[:, 0], self.directions])
+        aperture = np.concatenate([seen[:, 2], np.zeros(_DIRECTIONS)])
+        about = self.centre[0] * np.cos(phi) + self.centre[1] * np.sin(phi)
+        self._values = np.concatenate([seen[:, 1], own]) - about
+        self._weights = np.concatenate([np.ones(len(seen)), np.full(_DIRECTIONS, _VOXEL_WEIGHT)])
+        self.view_of = seen[:, 3].astype(np.intp)
+        looks = (np.arange(_LOOKS) + 0.5) / _LOOKS - 0.5
+        self._design = np.mean([self._basis(np.asarray(phi + k * aperture)) for k in looks], axis=0)
+        self._basis_out = self._basis(self.directions)
+        # Σρ cos = Σρ sin = 0: the outline closes.
+        closing = np.zeros((2, self._design.shape[1]))
+        closing[0, :_DIRECTIONS] = np.cos(self.directions)
+        closing[1, :_DIRECTIONS] = np.sin(self.directions)
+        self._closing = 10.0 * closing
+
+    def _basis(self, phi: FloatArray) -> FloatArray:
+        """Response of h at φ to the radii of curvature ρ = h + h'' ≥ 0 at all directions, and to a shift."""
+        t = np.mod(phi[:, None] - self.directions[None, :], TWO_PI)
+        green = ((math.pi - t) * np.sin(t)) / TWO_PI + np.cos(t) / (2.0 * TWO_PI)
+        shift = np.stack([np.cos(phi), -np.cos(phi), np.sin(phi), -np.sin(phi)], axis=1)
+        return np.concatenate([green, shift], axis=1)
+
+    def solve(self, share: FloatArray | None = None, rounds: int = 4) -> FloatArray:
+        """Return h (m) about `centre` at every direction.
+
+        Parameters
+        ----------
+        share : ndarray, shape (count,), optional
+            How often each side counts, when views are resampled.
+        rounds : int
+            Rounds of Tukey's biweight, against sides that something else was taken for.
+        """
+        weights = self._weights.copy()
+        if share is not None:
+            weights[: self.count] *= np.sqrt(share)
+        robust = np.ones_like(weights)
+        solution = np.zeros(self._design.shape[1])
+        for _ in range(rounds):
+            w = weights * robust
+            left = np.concatenate([self._design * w[:, None], self._closing])
+            right = np.concatenate([self._values * w, [0.0, 0.0]])
+            normal = left.T @ left
+            # The normal equations' root: as many rows as unknowns, whatever the number of views.
+            root = np.linalg.cholesky(normal + 1e-9 * np.trace(normal) / len(normal) * np.eye(len(normal)))
+            solution, _ = nnls(root.T, np.linalg.solve(root, left.T @ right), maxiter=50 * len(normal))
+            residual = self._values - self._design @ solution
+            spread = 1.4826 * float(np.median(np.abs(residual[: self.count]))) + 1e-4
+            robust = np.sqrt(np.clip(1.0 - (residual / (4.0 * spread)) ** 2, 0.0, None))
+            robust[self.count :] = 1.0
+        return np.asarray(self._basis_out @ solution)
+
+
+def _voxel_support(grid: VoxelGrid, directions: FloatArray) -> FloatArray:
+    """Return the support of the occupied voxels' plan; its edges lie about 0.3 voxels outside of centres."""
+    volume = grid.volume
+    j, i = np.nonzero(grid.occupied.any(axis=0))
+    plan = np.stack([volume.x_m[i], volume.y_m[j]], axis=1)
+    reach = plan @ np.stack([np.cos(directions), np.sin(directions)])
+    return np.asarray(reach.max(axis=0) + 0.3 * volume.voxel_size_m)
+
+
+@dataclass(frozen=True)
+class _Rectangle:
+    length_m: float
+    width_m: float
+    heading_rad: float
+    position_m: tuple[float, float]
+
+
+def _rectangle(support: FloatArray, centre: FloatArray) -> _Rectangle:
+    """Return the smallest rectangle round a plan with that support."""
+    n = len(support)
+    fine = 3  # one degree
+    angles = np.arange(n * fine) * (TWO_PI / (n * fine))
+    h = np.interp(angles, np.arange(n + 1) * (TWO_PI / n), np.append(support, support[0]))
+    m = len(h)
+    widths = h + np.roll(h, -m // 2)
+    quarter = m // 4
+    a = int(np.argmin((widths * np.roll(widths, -quarter))[:quarter]))
+    b = a + quarter
+    if widths[a] < widths[b]:
+        a, b = b, a
+    middle = np.array(centre, dtype=np.float64)
+    for k in (a, b):
+        off = (h[k] - h[(k + m // 2) % m]) / 2.0
+        middle += off * np.array([math.cos(angles[k]), math.sin(angles[k])])
+    return _Rectangle(
+        float(widths[a]), float(widths[b]), float(angles[a] % math.pi), (float(middle[0]), float(middle[1]))
+    )
+
+
+def cap_height(grid: VoxelGrid, grazing_rad: float) -> tuple[float, float]:
+    """Return the height at which the cap begins that shadows leave on any top, and the cap's own top (m).
+
+    Parameters
+    ----------
+    grid : VoxelGrid
+        Carved grid with an object.
+    grazing_rad : float
+        ψ: a layer of inscribed radius R carries a cap tan ψ · R high.
+    """
+    d = grid.volume.voxel_size_m
+    layers = np.flatnonzero(grid.occupied.any(axis=(1, 2)))
+    faces = grid.volume.z_m[layers] + d / 2.0
+    reach = np.empty(len(layers))
+    for n, k in enumerate(layers):
+        inside = scipy.ndimage.distance_transform_edt(np.pad(grid.occupied[k], 1))
+        reach[n] = faces[n] + math.tan(grazing_rad) * (float(inside.max()) - 0.5) * d
+    top = float(reach.max())
+    begins = []
+    for slack in _CAP_SLACK:
+        # The lowest layer from which the cap alone reaches the top, interpolated between layers.
+        limit = top - slack * d
+        first = int(np.argmax(reach >= limit))
+        below = max(first - 1, 0)
+        rise = max(float(reach[first] - reach[below]), 1e-9)
+        share = float(np.clip((limit - reach[below]) / rise, 0.0, 1.0))
+        begins.append(float(faces[below] + share * (faces[first] - faces[below])))
+    return float(np.mean(begins)), float(faces[-1])
+
+
+def shadow_height(side: SilhouetteSides, dimensions: Dimensions) -> float:
+    """Return the height (m) that one view's shadow length implies.
+
+    z = s_z (ρ_tip - ρ_top) / (s + ρ_tip): the ray over the top, at down-range ρ_top, meets the seabed at the
+    shadow's tip ρ_tip; s is the sonar's ground range to the scene's origin. The far side of the plan's
+    rectangle is taken for ρ_top, which is exact for an upright box and too far for a target that is narrower
+    at the top: a lower bound.
+    """
+    info = side.info
+    axis = down_range_axis(info.aspect_rad)
+    along = np.array([math.cos(dimensions.heading_rad), math.sin(dimensions.heading_rad)])
+    across = np.array([-along[1], along[0]])
+    reach = 0.5 * (dimensions.length_m * abs(along @ axis) + dimensions.width_m * abs(across @ axis))
+    top = float(axis @ np.asarray(dimensions.position_m)) + reach
+    sonar = info.camera.sonar_m
+    ground_range = -float(axis @ sonar[:2])
+    return float(sonar[2] * (side.tip_m - top) / (ground_range + side.tip_m))
+
+
+def measure_object(
+    grid: VoxelGrid, mesh: trimesh.Trimesh, sides: Sequence[SilhouetteSides], *, seed: int = 0
+) -> Dimensions:
+    """Measure the carved object, with 95 % intervals.
+
+    Parameters
+    ----------
+    grid : VoxelGrid
+        Carved grid with an object.
+    mesh : trimesh.Trimesh
+        Its surface.
+    sides : sequence of SilhouetteSides
+        Of all views; few or none: the surface alone is measured, without intervals.
+    seed : int
+        Of the resampling.
+
+    Returns
+    -------
+    Dimensions
+        Length, width, heading and position of the plan, from the silhouettes; height from the carved layers;
+        volume of the surface. Intervals of length and width come from resampling the views in blocks of an
+        aperture (neighbours share their looks), with the error of an edge (half of a cross-range cell) added
+        in quadrature.
+
+    Notes
+    -----
+    Volume is that of the shadow hull, whose hollows no shadow shows: its interval is that of the hull.
+    """
+    whole = measure(mesh)
+    sides = sorted(sides, key=lambda side: side.info.stamp_ns)
+    fit = PlanFit(sides, grid)
+    if fit.count < _MIN_EDGES:
+        return whole
+    support = fit.solve()
+    plan = _rectangle(support, fit.centre)
+    grazing = float(np.median([side.info.camera.grazing_rad for side in sides]))
+    height, cap = cap_height(grid, grazing)
+    resampled = _resampled(fit, sides, seed)
+    down, across = (float(np.median([s.info.resolution_m[axis] for s in sides])) for axis in (0, 1))
+    edge = _EDGE_CELLS * across
+    intervals = {}
+    for name in ("length_m", "width_m"):
+        value = getattr(plan, name)
+        sigma = math.hypot(float(np.std([getattr(r, name) for r in resampled])), edge)
+        intervals[name] = (max(0.0, value - _SIGMAS_95 * sigma), value + _SIGMAS_95 * sigma)
+    for axis, name in enumerate(("position_x_m", "position_y_m")):
+        sigma = math.hypot(float(np.std([r.position_m[axis] for r in resampled])), edge / 2.0)
+        value = plan.position_m[axis]
+        intervals[name] = (value - _SIGMAS_95 * sigma, value + _SIGMAS_95 * sigma)
+    turns = [math.remainder(r.heading_rad - plan.heading_rad, math.pi) for r in resampled]
+    sigma = math.hypot(float(np.sqrt(np.mean(np.square(turns)))), edge / plan.length_m)
+    intervals["heading_rad"] = (
+        plan.heading_rad - _SIGMAS_95 * sigma,
+        plan.heading_rad + _SIGMAS_95 * sigma,
+    )
+    d = grid.volume.voxel_size_m
+    # The true top lies anywhere in the cap.
+    sigma = math.hypot(d / 2.0, down * math.tan(grazing), max(cap - height, 0.0) / 3.0)
+    intervals["height_m"] = (max(0.0, height - _SIGMAS_95 * sigma), height + _SIGMAS_95 * sigma)
+    # A surface that lies wrong by one error everywhere.
+    change = float(mesh.area) * math.hypot(edge / 2.0, d / 4.0)
+    intervals["volume_m3"] = (max(0.0, whole.volume_m3 - change), whole.volume_m3 + change)
+    return replace(
+        whole,
+        length_m=plan.length_m,
+        width_m=plan.width_m,
+        height_m=height,
+        heading_rad=plan.heading_rad,
+        position_m=plan.position_m,
+        hull_top_m=cap,
+        intervals=intervals,
+    )
+
+
+def _resampled(fit: PlanFit, sides: Sequence[SilhouetteSides], seed: int) -> list[_Rectangle]:
+    """Fit the plan to views drawn again and again, in blocks of an aperture."""
+    rng = np.random.default_rng(seed)
+    aperture = max(float(np.median([s.info.aperture_rad for s in sides])), 1e-3)
+    block = np.floor(np.array([s.info.aspect_rad % TWO_PI for s in sides]) / aperture).astype(np.intp)
+    names, block = np.unique(block, return_inverse=True)
+    out = []
+    for _ in range(_RESAMPLINGS):
+        drawn = np.bincount(rng.integers(0, len(names), len(names)), minlength=len(names))
+        share = drawn[block][fit.view_of].astype(np.float64)
+        out.append(_rectangle(fit.solve(share, rounds=2), fit.centre))
+    return out
+
+
+__all__ = [
+    "PlanFit",
+    "SilhouetteSides",
+    "cap_height",
+    "levels_of_mask",
+    "measure_object",
+    "shadow_height",
+    "silhouette_sides",
+]
