@@ -13,6 +13,8 @@ PY := $(VENV)/bin/python
 DEMO_BAG ?= bags/demo
 DEMO_OUT ?= results/demo
 PYTEST_WORKERS ?= 2
+# More arguments of the accuracy benchmark: make accuracy ACCURACY_ARGUMENTS=--resume
+ACCURACY_ARGUMENTS ?=
 
 # ROS 2 from PyPI needs its prefix named, stays on this machine, and wants a place for its logs.
 export AMENT_PREFIX_PATH := $(abspath $(VENV))$(if $(AMENT_PREFIX_PATH),:$(AMENT_PREFIX_PATH))
@@ -24,7 +26,7 @@ SOURCES := $(shell find csas_shadow_ros msg_adapters config launch -type f \
 	-not -name '*.pyc' -not -path '*/__pycache__*' 2>/dev/null)
 PACKAGING := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help venv install demo test lint types unit build clean
+.PHONY: help venv install demo test lint types unit accuracy build clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 18
@@ -64,6 +66,9 @@ types: install ## mypy
 unit: install ## pytest alone
 	@mkdir -p $(ROS_LOG_DIR)
 	$(PY) -m pytest -n $(PYTEST_WORKERS)
+
+accuracy: install ## the accuracy benchmark: writes docs/accuracy.md
+	$(PY) benchmarks/accuracy.py $(ACCURACY_ARGUMENTS)
 
 $(COLCON_VENV)/.installed: setup.py
 	@test -n "$(PYTHON)" || { echo "no Python 3.10 to 3.13 with venv found: name one, make PYTHON=..." >&2; exit 1; }
