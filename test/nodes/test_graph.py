@@ -350,9 +350,7 @@ def test_without_a_target_views_are_held_and_not_guessed_at(
     x, y = target.position_m
     outside = graph.plain_node("finder")
     messages = RclpyMessages()
-    publisher = outside.create_publisher(
-        messages.cls("visualization_msgs/msg/Marker"), "target", qos.LATCHED
-    )
+    publisher = outside.create_publisher(messages.cls("visualization_msgs/msg/Marker"), "target", qos.LATCHED)
     publisher.publish(target_to_msg(messages, TargetBox((x, y, 1.0), target.size_m), 1))
     graph.spin_until(complete(carver))
     assert_same_grid(carver, reference)

@@ -34,8 +34,7 @@ from msg_adapters import RclpyMessages
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = {
-    n.name: n
-    for n in (SubApertureNode, ShadowLikelihoodNode, VoxelCarverNode, CompositesNode, BagPlayerNode)
+    n.name: n for n in (SubApertureNode, ShadowLikelihoodNode, VoxelCarverNode, CompositesNode, BagPlayerNode)
 }
 
 

@@ -103,8 +103,10 @@ def test_a_raised_scatterer_is_imaged_at_its_layover_position_towards_the_sonar(
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("aspect_deg", [20.0, 110.0, 200.0, 290.0])
 def test_a_box_darkens_the_seabed_behind_it_by_the_stated_contrast(box_run, sign, aspect_deg):
-    run = box_run if sign == 1 else simulate(
-        TINY, BOX, seed=3, position_m=(0.15, -0.1), heading_deg=20, spectrum_sign=-1
+    run = (
+        box_run
+        if sign == 1
+        else simulate(TINY, BOX, seed=3, position_m=(0.15, -0.1), heading_deg=20, spectrum_sign=-1)
     )
     grid, width = run.image.grid, 16.0
     power = np.abs(sub_aperture(run, aspect_deg, width)) ** 2
