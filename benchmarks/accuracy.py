@@ -135,7 +135,7 @@ class Settings:
     """
 
     profile: str = "standard"
-    step_deg: float = 2.0
+    step_deg: float = 3.0
     enhancements: tuple[str, ...] = (WITH_FFSE, WITHOUT_FFSE)
 
     @property
@@ -437,12 +437,14 @@ def plan(
     targets: Iterable[str], seeds: Sequence[int], conditions: Sequence[str], empty_seabeds: int
 ) -> list[Case]:
     """List the cases in the order in which they are reported."""
+    named = list(targets)
     cases: list[Case] = []
-    for target in targets:
-        if target == EMPTY:
-            cases += [Case(EMPTY, seed) for seed in range(1, empty_seabeds + 1)]
-        else:
-            cases += [Case(target, seed, condition) for seed in seeds for condition in conditions]
+    for condition in conditions:
+        for target in named:
+            if target != EMPTY:
+                cases += [Case(target, seed, condition) for seed in seeds]
+            elif condition == conditions[0]:
+                cases += [Case(EMPTY, seed) for seed in range(1, empty_seabeds + 1)]
     return cases
 
 
@@ -1075,7 +1077,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--empty-seabeds", type=int, default=EMPTY_SEABEDS, metavar="N", help=f"{EMPTY_SEABEDS}")
     add("--profile", choices=list(PROFILES), default="standard")
-    add("--step-deg", type=float, help="aspect step between views: 2, short form 6")
+    add("--step-deg", type=float, help="aspect step between views: 3, short form 6")
     add("--jobs", type=int, default=2, help="processes, one case each: 2")
     add(
         "--out",
@@ -1130,7 +1132,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except AccuracyError as error:
             print(f"error: {error}", file=sys.stderr)
             return 2
-    settings = Settings(options.profile, 2.0 if options.step_deg is None else options.step_deg)
+    settings = Settings(options.profile, 3.0 if options.step_deg is None else options.step_deg)
     cases = plan(options.targets or TARGETS, options.seeds, options.conditions, options.empty_seabeds)
     record = options.out.with_suffix(".jsonl")
     rows = run_cases(cases, settings, record, jobs=options.jobs, resume=options.resume)
