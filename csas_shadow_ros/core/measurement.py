@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -45,8 +46,12 @@ _TAPER_PX = 2.5
 _BULGE_PX = 0.8
 #: Fewer rows than this give no edge.
 _MIN_ROWS = 8
-#: Directions of the plan, and looks over an aperture.
+#: Directions that a plan's sides may face, and looks over an aperture.
 _DIRECTIONS, _LOOKS = 120, 9
+#: A side that holds this share of the outline gets finer directions round it: so many, so far apart (rad).
+_FLAT_SHARE, _FINE, _FINE_STEP_RAD = 0.08, 4, math.radians(0.5)
+#: Directions that the smallest rectangle is looked for among.
+_FINE_DIRECTIONS = 720
 #: After enhancement a straight side is seen so many cross-range cells outside of the mean over the aperture:
 #: the seabed is out of focus where the shadow is in focus, as light is behind a knife's edge. Measured on the
 #: simulated box and frame: 0.1 to 0.25; the least is taken, as round sides show less of it.
@@ -59,10 +64,10 @@ _FOREIGN_CELLS = 3.0
 #: Fewer edges than this give no plan: the voxels alone are measured then.
 _MIN_EDGES = 24
 #: Resamplings of the views.
-_RESAMPLINGS = 30
+_RESAMPLINGS = 20
 #: Error of one extent besides what resampling shows (1σ), in cross-range cells: edges are found to a fraction
 #: of one.
-_EDGE_CELLS = 0.5
+_EDGE_CELLS = 0.6
 #: Where the cap begins: the mean of these two, voxels under the cap's top.
 _CAP_SLACK = (0.2, 0.3)
 _SIGMAS_95 = 1.96
@@ -203,12 +208,24 @@ def _fitted_side(along: FloatArray, out_px: FloatArray) -> tuple[FloatArray, boo
 class PlanFit:
     """Least-squares support function of a plan from the sides of silhouettes.
 
+    The outline is a polygon whose sides face fixed directions, at first every 3°, then also finely round the
+    directions that long sides were found to face.
+
     Parameters
     ----------
     sides : sequence of SilhouetteSides
         Of all views.
     grid : VoxelGrid
         Carved voxels, which stand in where no side is seen.
+
+    Attributes
+    ----------
+    count : int
+        Sides that take part.
+    centre : ndarray, shape (2,)
+        Ground point (m) that supports are taken about.
+    directions : ndarray, shape (720,)
+        Directions (rad) that `solve` answers for.
     """
 
     def __init__(self, sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> None:
@@ -218,67 +235,79 @@ class PlanFit:
             for phi, support in zip(side.direction_rad, side.support_m, strict=True)
         ]
         seen = np.array(pairs, dtype=np.float64).reshape(-1, 4)
-        self.directions: FloatArray = np.arange(_DIRECTIONS, dtype=np.float64) * (TWO_PI / _DIRECTIONS)
-        own = _voxel_support(grid, self.directions)
+        self.directions: FloatArray = _round_circle(_FINE_DIRECTIONS)
+        coarse = _round_circle(_DIRECTIONS)
+        own = _voxel_support(grid, coarse)
         if len(seen):
             cell = float(np.median([side.info.resolution_m[1] for side in sides]))
             margin = _FOREIGN_CELLS * cell + grid.volume.voxel_size_m
-            expected = np.interp(seen[:, 0] % TWO_PI, self.directions, own, period=TWO_PI)
+            expected = np.interp(seen[:, 0] % TWO_PI, coarse, own, period=TWO_PI)
             seen = seen[np.abs(seen[:, 1] - expected) <= margin]
         self.count = len(seen)
-        self.centre = 2.0 * np.array(
-            [np.mean(own * np.cos(self.directions)), np.mean(own * np.sin(self.directions))]
-        )
-        phi = np.concatenate([seen[:, 0], self.directions])
-        aperture = np.concatenate([seen[:, 2], np.zeros(_DIRECTIONS)])
-        about = self.centre[0] * np.cos(phi) + self.centre[1] * np.sin(phi)
+        self.centre = 2.0 * np.array([np.mean(own * np.cos(coarse)), np.mean(own * np.sin(coarse))])
+        self._phi = np.concatenate([seen[:, 0], coarse])
+        self._aperture = np.concatenate([seen[:, 2], np.zeros(_DIRECTIONS)])
+        about = self.centre[0] * np.cos(self._phi) + self.centre[1] * np.sin(self._phi)
         self._values = np.concatenate([seen[:, 1], own]) - about
-        self._weights = np.concatenate([np.ones(len(seen)), np.full(_DIRECTIONS, _VOXEL_WEIGHT)])
+        self._weights = np.concatenate([np.ones(self.count), np.full(_DIRECTIONS, _VOXEL_WEIGHT)])
+        self._robust = np.ones_like(self._weights)
         self.view_of = seen[:, 3].astype(np.intp)
-        looks = (np.arange(_LOOKS) + 0.5) / _LOOKS - 0.5
-        self._design = np.mean([self._basis(np.asarray(phi + k * aperture)) for k in looks], axis=0)
-        self._basis_out = self._basis(self.directions)
-        # Σρ cos = Σρ sin = 0: the outline closes.
-        closing = np.zeros((2, self._design.shape[1]))
-        closing[0, :_DIRECTIONS] = np.cos(self.directions)
-        closing[1, :_DIRECTIONS] = np.sin(self.directions)
-        self._closing = 10.0 * closing
+        self._face(coarse)
+        radii = self._solve(self._weights)[: len(coarse)]
+        flat = coarse[radii > _FLAT_SHARE * radii.sum()]
+        steps = np.arange(-_FINE, _FINE + 1) * _FINE_STEP_RAD
+        self._face(np.unique(np.mod(np.concatenate([coarse, (flat[:, None] + steps).ravel()]), TWO_PI)))
 
-    def _basis(self, phi: FloatArray) -> FloatArray:
-        """Response of h at φ to the radii of curvature ρ = h + h'' ≥ 0 at all directions, and to a shift."""
-        t = np.mod(phi[:, None] - self.directions[None, :], TWO_PI)
+    def _face(self, faces: FloatArray) -> None:
+        """Let the outline's sides face these directions."""
+        self._faces = faces
+        looks = (np.arange(_LOOKS) + 0.5) / _LOOKS - 0.5
+        self._design = np.mean([self._basis(self._phi + look * self._aperture) for look in looks], axis=0)
+        # Σρ cos = Σρ sin = 0: the outline closes.
+        self._closing = np.zeros((2, self._design.shape[1]))
+        self._closing[0, : len(faces)] = 10.0 * np.cos(faces)
+        self._closing[1, : len(faces)] = 10.0 * np.sin(faces)
+
+    def _basis(self, phi: NDArray[Any]) -> FloatArray:
+        """Response of h at φ to the lengths ρ = h + h'' ≥ 0 of the sides, and to a shift."""
+        t = np.mod(phi[:, None] - self._faces[None, :], TWO_PI)
         green = ((math.pi - t) * np.sin(t)) / TWO_PI + np.cos(t) / (2.0 * TWO_PI)
         shift = np.stack([np.cos(phi), -np.cos(phi), np.sin(phi), -np.sin(phi)], axis=1)
         return np.concatenate([green, shift], axis=1)
 
-    def solve(self, share: FloatArray | None = None, rounds: int = 4) -> FloatArray:
+    def _solve(self, weights: FloatArray) -> FloatArray:
+        left = np.concatenate([self._design * weights[:, None], self._closing])
+        right = np.concatenate([self._values * weights, [0.0, 0.0]])
+        normal = left.T @ left
+        # The normal equations' root: as many rows as unknowns, whatever the number of views.
+        root = np.linalg.cholesky(normal + 1e-9 * np.trace(normal) / len(normal) * np.eye(len(normal)))
+        solution, _ = nnls(root.T, np.linalg.solve(root, left.T @ right), maxiter=50 * len(normal))
+        return np.asarray(solution, dtype=np.float64)
+
+    def solve(self, rounds: int = 3) -> FloatArray:
         """Return h (m) about `centre` at every direction.
 
         Parameters
         ----------
-        share : ndarray, shape (count,), optional
-            How often each side counts, when views are resampled.
         rounds : int
             Rounds of Tukey's biweight, against sides that something else was taken for.
         """
-        weights = self._weights.copy()
-        if share is not None:
-            weights[: self.count] *= np.sqrt(share)
-        robust = np.ones_like(weights)
-        solution = np.zeros(self._design.shape[1])
         for _ in range(rounds):
-            w = weights * robust
-            left = np.concatenate([self._design * w[:, None], self._closing])
-            right = np.concatenate([self._values * w, [0.0, 0.0]])
-            normal = left.T @ left
-            # The normal equations' root: as many rows as unknowns, whatever the number of views.
-            root = np.linalg.cholesky(normal + 1e-9 * np.trace(normal) / len(normal) * np.eye(len(normal)))
-            solution, _ = nnls(root.T, np.linalg.solve(root, left.T @ right), maxiter=50 * len(normal))
-            residual = self._values - self._design @ solution
-            spread = 1.4826 * float(np.median(np.abs(residual[: self.count]))) + 1e-4
-            robust = np.sqrt(np.clip(1.0 - (residual / (4.0 * spread)) ** 2, 0.0, None))
-            robust[self.count :] = 1.0
-        return np.asarray(self._basis_out @ solution)
+            solution = self._solve(self._weights * self._robust)
+            residual = (self._values - self._design @ solution)[: self.count]
+            spread = 1.4826 * float(np.median(np.abs(residual))) + 1e-4
+            self._robust[: self.count] = np.sqrt(np.clip(1.0 - (residual / (4.0 * spread)) ** 2, 0.0, None))
+        return np.asarray(self._basis(self.directions) @ solution)
+
+    def resampled(self, share: FloatArray) -> FloatArray:
+        """Return h as `solve` does, each side counting `share` times, shape (count,)."""
+        weights = self._weights * self._robust
+        weights[: self.count] *= np.sqrt(share)
+        return np.asarray(self._basis(self.directions) @ self._solve(weights))
+
+
+def _round_circle(count: int) -> FloatArray:
+    return np.arange(count, dtype=np.float64) * (TWO_PI / count)
 
 
 def _voxel_support(grid: VoxelGrid, directions: FloatArray) -> FloatArray:
@@ -300,11 +329,8 @@ class _Rectangle:
 
 def _rectangle(support: FloatArray, centre: FloatArray) -> _Rectangle:
     """Return the smallest rectangle round a plan with that support."""
-    n = len(support)
-    fine = 3  # one degree
-    angles = np.arange(n * fine) * (TWO_PI / (n * fine))
-    h = np.interp(angles, np.arange(n + 1) * (TWO_PI / n), np.append(support, support[0]))
-    m = len(h)
+    h, m = support, len(support)
+    angles = _round_circle(m)
     widths = h + np.roll(h, -m // 2)
     quarter = m // 4
     a = int(np.argmin((widths * np.roll(widths, -quarter))[:quarter]))
@@ -390,7 +416,7 @@ def measure_object(
     Dimensions
         Length, width, heading and position of the plan, from the silhouettes; height from the carved layers;
         volume of the surface. Intervals of length and width come from resampling the views in blocks of an
-        aperture (neighbours share their looks), with the error of an edge (half of a cross-range cell) added
+        aperture (neighbours share their looks), with the error of an edge (0.6 of a cross-range cell) added
         in quadrature.
 
     Notes
@@ -453,7 +479,7 @@ def _resampled(fit: PlanFit, sides: Sequence[SilhouetteSides], seed: int) -> lis
     for _ in range(_RESAMPLINGS):
         drawn = np.bincount(rng.integers(0, len(names), len(names)), minlength=len(names))
         share = drawn[block][fit.view_of].astype(np.float64)
-        out.append(_rectangle(fit.solve(share, rounds=2), fit.centre))
+        out.append(_rectangle(fit.resampled(share), fit.centre))
     return out
 
 
