@@ -26,10 +26,10 @@ SOURCES := $(shell find csas_shadow_ros msg_adapters config launch -type f \
 	-not -name '*.pyc' -not -path '*/__pycache__*' 2>/dev/null)
 PACKAGING := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help venv install demo test lint types unit accuracy build clean
+.PHONY: help venv install demo test lint types unit accuracy accuracy-short build clean
 
 help: ## list the targets
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 18
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
 
 venv: $(VENV)/.created ## make the virtual environment
 
@@ -66,6 +66,9 @@ types: install ## mypy
 unit: install ## pytest alone
 	@mkdir -p $(ROS_LOG_DIR)
 	$(PY) -m pytest -n $(PYTEST_WORKERS)
+
+accuracy-short: install ## a few cases of it against their floors, in a minute
+	$(PY) benchmarks/accuracy.py --short
 
 accuracy: install ## the accuracy benchmark: writes docs/accuracy.md
 	$(PY) benchmarks/accuracy.py $(ACCURACY_ARGUMENTS)

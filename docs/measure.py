@@ -12,19 +12,21 @@ hull, the voxels that perfect silhouettes would leave.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from csas_shadow_ros.core import reference
-from csas_shadow_ros.core.carving import MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, Carver
+from csas_shadow_ros.core import reference, segmentation
+from csas_shadow_ros.core.carving import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, Carver
 from csas_shadow_ros.core.geometry import ShadowCamera, View
-from csas_shadow_ros.core.likelihood import echo_mask
 from csas_shadow_ros.core.parameters import (
     CarvingParameters,
     PipelineParameters,
@@ -41,7 +43,7 @@ from csas_shadow_ros.core.volume import Volume
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.hull import iou, shadow_hull
 
-TARGETS = ("box", "cone", "tyre", "sphere", "cylinder", "frame")
+TARGETS = ("box", "cone", "tyre", "sphere", "cylinder", "rock", "frame", "l_shape")
 SEED = 1
 FINE = 4  # pixels of the literal path, and of the image, in one of the fast path's
 
@@ -132,25 +134,45 @@ def _print_search(evidence: SignEvidence, best: Target | None, true_m: tuple[flo
     print(f"  target {math.hypot(*best.position_m):.2f} m off its place, volume {size} m for {true} m")
 
 
+#: What the segmentation does, each left out in turn.
+SEGMENTATION_WITHOUT: dict[str, dict[str, Any]] = {
+    "  square averaging box": {"_HALF_CELLS": (1.0, 1.0)},
+    "  far end not put back": {"_drawn_down": lambda dark, rows: dark},
+}
+
+
+@contextlib.contextmanager
+def patched(module: Any, **values: Any) -> Iterator[None]:
+    """Replace names of a module for a while."""
+    before = {name: getattr(module, name) for name in values}
+    for name, value in values.items():
+        setattr(module, name, value)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(module, name, value)
+
+
 class _Variants:
     """Carvers of one volume, each fed another reading of the same views."""
 
     def __init__(self) -> None:
-        self.views: list[tuple[View, View, NDArray[np.bool_], NDArray[np.bool_]]] = []
+        self.views: list[tuple[View, View, NDArray[np.bool_]]] = []
 
     def __call__(self, view: ProcessedView) -> None:
         levels = view.levels
-        echo = echo_mask(levels.power, levels.known, 8.0)
-        self.views.append((view.mask, view.likelihood, echo, levels.known))
+        self.views.append((view.mask, view.likelihood, levels.known))
 
     def masks(self, unknown: str) -> list[View]:
-        """Return the masks with all of the unknown zone, the bright echo alone, or nothing but off-image."""
+        """Return the masks as they are, with the bright echo alone unknown, or nothing but off-image."""
         out = []
-        for mask, _, echo, known in self.views:
+        for mask, _, known in self.views:
             pixels = mask.pixels.copy()
             if unknown != "zone":
-                keep = echo | ~known if unknown == "echo" else ~known
-                pixels[(pixels == MASK_UNKNOWN) & ~keep] = MASK_OUTSIDE
+                pixels[pixels == MASK_COVERED] = MASK_OUTSIDE
+            if unknown == "none":
+                pixels[(pixels == MASK_UNKNOWN) & known] = MASK_OUTSIDE
             out.append(replace(mask, pixels=pixels))
         return out
 
@@ -179,6 +201,11 @@ def carve(names: tuple[str, ...]) -> None:
         hull = shadow_hull(made.truth.target, [v[0].info.camera.sonar_m for v in keep.views], volume)
         grid = result.grid
         rows: dict[str, float] = {"default (consensus)": iou(grid.occupied, hull)}
+        both = _carve(keep.masks("zone"), volume, "consensus")
+        rows["  one look only"] = iou(both.first_look().occupied, hull)
+        enough = grid.views >= 0.25 * grid.views.max()
+        known = np.where(enough, grid.likelihood, np.float32(np.nan))
+        rows["  high tops unknown"] = iou(occupied_voxels(known, grid.threshold, "consensus"), hull)
         for label, unknown in (("  echo alone unknown", "echo"), ("  echo read as outside", "none")):
             rows[label] = iou(_carve(keep.masks(unknown), volume, "consensus").grid().occupied, hull)
         with np.errstate(invalid="ignore"):
@@ -195,20 +222,28 @@ def carve(names: tuple[str, ...]) -> None:
         rows["  best threshold (soft)"] = max(
             iou(occupied_voxels(mean, t, "soft"), hull) for t in np.arange(0.02, 0.4, 0.02)
         )
-        plain = PipelineParameters(
-            sub_aperture=SubApertureParameters(step_deg=2.0, check_sign=False),
-            shadow=ShadowParameters(enhancement="none"),
-            target=TargetParameters("given", result.target.position_m, result.target.size_m),
-        )
-        bare = run(made.image, made.track, plain)
+        bare = run(made.image, made.track, _given(result.target, "none"))
         if bare.grid is None:
             raise SystemExit(f"nothing was found of {name} without enhancement")
         rows["no enhancement (consensus)"] = iou(bare.grid.occupied, hull)
+        for label, patch in SEGMENTATION_WITHOUT.items():
+            with patched(segmentation, **patch):
+                views = run(made.image, made.track, _given(result.target))
+            rows[label] = 0.0 if views.grid is None else iou(views.grid.occupied, hull)
         for label, value in rows.items():
             table.setdefault(label, []).append(f"{value:10.2f}")
     print(f"{'IoU with the shadow hull':28}" + "".join(f"{n:>10}" for n in names))
     for label, values in table.items():
         print(f"{label:28}" + "".join(values))
+
+
+def _given(target: Target, enhancement: str = "exact") -> PipelineParameters:
+    """Return parameters that carve the same volume again."""
+    return PipelineParameters(
+        sub_aperture=SubApertureParameters(step_deg=2.0, check_sign=False),
+        shadow=ShadowParameters(enhancement=enhancement),
+        target=TargetParameters("given", target.position_m, target.size_m),
+    )
 
 
 def _largest(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:

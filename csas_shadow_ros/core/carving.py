@@ -211,10 +211,14 @@ class Carver:
         VoxelGrid
             With NaN threshold and nothing occupied where there is no object.
         """
-        first = thresholded(self.volume, self.likelihood(), self._count.copy(), self.parameters)
+        first = self.first_look()
         if self.parameters.method != "consensus" or not first.occupied.any():
             return first
         return self._second_look(first)
+
+    def first_look(self) -> VoxelGrid:
+        """Threshold what has been carved so far, covered pixels unknown: what `grid` starts from."""
+        return thresholded(self.volume, self.likelihood(), self._count.copy(), self.parameters)
 
     def _second_look(self, first: VoxelGrid) -> VoxelGrid:
         """Carve again what the first look left, with the pixels that its own echo cannot cover as seabed."""
