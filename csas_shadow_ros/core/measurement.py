@@ -414,10 +414,11 @@ def measure_object(
     Returns
     -------
     Dimensions
-        Length, width, heading and position of the plan, from the silhouettes; height from the carved layers;
-        volume of the surface. Intervals of length and width come from resampling the views in blocks of an
-        aperture (neighbours share their looks), with the error of an edge (0.6 of a cross-range cell) added
-        in quadrature.
+        Length, width, heading and position of the plan, from the silhouettes (from the surface where the
+        aperture is too narrow to smear them by half a voxel and a quarter of a cell); height from the carved
+        layers; volume of the surface. Intervals of length and width come from resampling the views in blocks
+        of an aperture (neighbours share their looks), with the error of an edge (0.6 of a cross-range cell)
+        added in quadrature.
 
     Notes
     -----
@@ -428,13 +429,18 @@ def measure_object(
     fit = PlanFit(sides, grid)
     if fit.count < _MIN_EDGES:
         return whole
-    support = fit.solve()
-    plan = _rectangle(support, fit.centre)
+    plan = _rectangle(fit.solve(), fit.centre)
     grazing = float(np.median([side.info.camera.grazing_rad for side in sides]))
     height, cap = cap_height(grid, grazing)
     resampled = _resampled(fit, sides, seed)
     down, across = (float(np.median([s.info.resolution_m[axis] for s in sides])) for axis in (0, 1))
     edge = _EDGE_CELLS * across
+    d = grid.volume.voxel_size_m
+    aperture = float(np.median([side.info.aperture_rad for side in sides]))
+    if 0.5 * whole.length_m * aperture / 4.0 < 0.5 * d + 0.25 * across:
+        # The aperture hardly smears the sides: the voxels are right about them, and also know low parts of
+        # the target whose own sides the echo covers in each view.
+        plan = _Rectangle(whole.length_m, whole.width_m, whole.heading_rad, whole.position_m)
     intervals = {}
     for name in ("length_m", "width_m"):
         value = getattr(plan, name)
@@ -450,7 +456,6 @@ def measure_object(
         plan.heading_rad - _SIGMAS_95 * sigma,
         plan.heading_rad + _SIGMAS_95 * sigma,
     )
-    d = grid.volume.voxel_size_m
     # The true top lies anywhere in the cap.
     sigma = math.hypot(d / 2.0, down * math.tan(grazing), max(cap - height, 0.0) / 3.0)
     intervals["height_m"] = (max(0.0, height - _SIGMAS_95 * sigma), height + _SIGMAS_95 * sigma)
