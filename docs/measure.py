@@ -4,9 +4,10 @@
     python docs/measure.py fast            # the fast path against the literal steps of the paper
     python docs/measure.py search [TARGET]  # target search and spectrum sign
     python docs/measure.py carve [TARGET]  # what enhancement, echo, support and threshold each do
+    python docs/measure.py hollows [TARGET]  # what echoes tell of hollows, and two ways that were not taken
 
-Every run is of the `standard` profile, seed 1. `carve` uses 180 views (2° steps); IoU is against the shadow
-hull, the voxels that perfect silhouettes would leave.
+Every run is of the `standard` profile, seed 1. `carve` and `hollows` use 180 views (2° steps); IoU is
+against the shadow hull, the voxels that perfect silhouettes would leave, where nothing else is said.
 """
 
 from __future__ import annotations
@@ -22,11 +23,14 @@ from typing import Any
 
 import numpy as np
 import scipy.ndimage
+import trimesh
 from numpy.typing import NDArray
 
 from csas_shadow_ros.core import reference, segmentation
 from csas_shadow_ros.core.carving import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, Carver
-from csas_shadow_ros.core.geometry import ShadowCamera, View
+from csas_shadow_ros.core.geometry import ShadowCamera, View, ViewInfo
+from csas_shadow_ros.core.hollows import EchoLook, _layover, _looks, _surface
+from csas_shadow_ros.core.likelihood import Levels, box_mean
 from csas_shadow_ros.core.parameters import (
     CarvingParameters,
     PipelineParameters,
@@ -39,12 +43,17 @@ from csas_shadow_ros.core.shadow import enhance, focus_range
 from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.core.target import SignEvidence, Target, spectrum_sign_evidence
 from csas_shadow_ros.core.threshold import occupied_voxels, supported
-from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.volume import Volume, VoxelGrid
 from csas_shadow_ros.simulation import simulate
-from csas_shadow_ros.simulation.hull import iou, shadow_hull
+from csas_shadow_ros.simulation.hull import iou, shadow_hull, voxelise_truth
+from csas_shadow_ros.simulation.scene import SceneModel
+from csas_shadow_ros.simulation.targets import box, cone, join_bodies
 
 TARGETS = ("box", "cone", "tyre", "sphere", "cylinder", "rock", "frame", "l_shape")
 SEED = 1
+#: What `hollows` looks at if nothing is named: what is hollow, then what is not, then what returns nothing.
+HOLLOW = ("tyre", "ring", "tub", "open_box", "frame", "frame_grid", "l_shape")
+SOLID = ("box", "cone", "cylinder", "sphere", "rock", "smooth_box", "smooth_cone")
 FINE = 4  # pixels of the literal path, and of the image, in one of the fast path's
 
 
@@ -246,6 +255,116 @@ def _given(target: Target, enhancement: str = "exact") -> PipelineParameters:
     )
 
 
+def _walls(floor_m: float) -> trimesh.Trimesh:
+    """Make a box of 0.8 × 0.5 × 0.35 m that is open above, with walls of 5 cm and a floor of that height."""
+    length, width, height, wall = 0.8, 0.5, 0.35, 0.05
+    inner = length - 2 * wall, width - 2 * wall
+    parts = [((length, wall, height), (0.0, s * (width - wall) / 2)) for s in (-1, 1)]
+    parts += [((wall, inner[1], height), (s * (length - wall) / 2, 0.0)) for s in (-1, 1)]
+    if floor_m:
+        parts.append(((*inner, floor_m), (0.0, 0.0)))
+    bodies = []
+    for size, (x, y) in parts:
+        body = trimesh.creation.box(size)
+        body.apply_translation((x, y, size[2] / 2))
+        bodies.append(body)
+    return join_bodies(bodies)
+
+
+def _hollow_target(name: str) -> trimesh.Trimesh | str:
+    """Return a target of `hollows`: some that the simulation does not name."""
+    own = {
+        "ring": lambda: trimesh.creation.torus(0.4, 0.08, major_sections=96, minor_sections=24),
+        "tub": lambda: _walls(0.24),
+        "open_box": lambda: _walls(0.0),
+        "smooth_box": box,
+        "smooth_cone": cone,
+    }
+    return own[name]() if name in own else name
+
+
+def _without_top_echoes(model: SceneModel, *arguments: Any) -> None:
+    """Scatter as the simulation does, but from faces that look up: a smooth top returns nothing."""
+    _SCATTER(model, *arguments)
+    model._amplitudes = np.where(model._normals[:, 2] > 0.95, 0, model._amplitudes)
+
+
+_SCATTER = SceneModel._scatter_on
+
+
+def _brightness(grid: VoxelGrid, views: list[tuple[ViewInfo, Levels]]) -> NDArray[np.float64]:
+    """Return the mean power (4 at most) over all views where each voxel is imaged, in view or not."""
+    volume, at = grid.volume, np.argwhere(grid.occupied)
+    x, y, z = volume.x_m[at[:, 2]], volume.y_m[at[:, 1]], volume.z_m[at[:, 0]]
+    total, count = np.zeros(len(at)), np.zeros(len(at))
+    for info, levels in views:
+        power = np.minimum(box_mean(levels.power, levels.known, (1, 1)), 4.0)
+        shift = _layover(info)
+        place = np.stack([x + z * shift[0], y + z * shift[1], np.ones_like(x)])
+        u, v, _ = np.floor(info.camera.ground_to_pixel @ place + 0.5).astype(int)
+        inside = (u >= 0) & (v >= 0) & (u < power.shape[1]) & (v < power.shape[0])
+        inside[inside] &= levels.known[v[inside], u[inside]]
+        total[inside] += power[v[inside], u[inside]]
+        count += inside
+    return np.asarray(total / np.maximum(count, 1.0))
+
+
+def _open_columns(grid: VoxelGrid, matter: NDArray[np.bool_], looks: list[EchoLook]) -> NDArray[np.bool_]:
+    """Take hollows for open down to the first voxel that is seen: no view sees further down."""
+    voxels = np.argwhere(_surface(matter)).astype(np.int32)
+    seen, _ = _looks(voxels, matter, grid.volume, looks)
+    lit = np.zeros_like(matter)
+    lit[tuple(voxels[seen >= 0.1 * len(looks)].T)] = True
+    gone = grid.occupied & ~matter
+    column = scipy.ndimage.binary_opening(gone.sum(axis=0) >= 2, np.ones((3, 3), bool))
+    out, opened = matter.copy(), np.zeros_like(column)
+    for k in range(matter.shape[0] - 1, -1, -1):
+        opened = (opened | (gone[k] & column)) & ~lit[k]
+        out[k] &= ~opened
+    return out
+
+
+def hollows(names: tuple[str, ...]) -> None:
+    """Print IoU with the truth before and after hollows are opened, and for two ways that were not taken."""
+    levels = np.arange(0.1, 1.01, 0.1)
+    print(
+        f"{'IoU with the truth':14}{'hull':>8}{'matter':>8}{'columns':>9}{'brightness 0.3':>16}"
+        f"{'its best':>10}   opened, time, memory; IoU with the shadow hull"
+    )
+    for name in names:
+        SceneModel._scatter_on = _without_top_echoes if name.startswith("smooth") else _SCATTER  # type: ignore
+        made = simulate("standard", _hollow_target(name), seed=SEED)
+        seen: list[tuple[ViewInfo, Levels]] = []
+
+        def keep(view: ProcessedView, seen: list[tuple[ViewInfo, Levels]] = seen) -> None:
+            seen.append((view.shadow.info, view.levels))
+
+        parameters = PipelineParameters(sub_aperture=SubApertureParameters(step_deg=2.0))
+        result = run(made.image, made.track, parameters, on_view=keep)
+        grid, matter = result.grid, result.matter
+        if grid is None or matter is None:
+            raise SystemExit(f"nothing was found of {name}")
+        truth = voxelise_truth(made.truth.target, grid.volume)
+        hull = shadow_hull(made.truth.target, [info.camera.sonar_m for info, _ in seen], grid.volume)
+        looks = list(result.looks.values())
+        columns = _open_columns(grid, matter, looks)
+        bright, scores = _brightness(grid, seen), {}
+        for level in levels:
+            kept = grid.occupied.copy()
+            kept[grid.occupied] = bright >= level
+            scores[round(float(level), 1)] = iou(kept, truth)
+        best = max(scores, key=lambda level: scores[level])
+        opened = int(np.count_nonzero(grid.occupied & ~matter))
+        kilobytes = float(np.mean([len(look.packed) for look in looks])) / 1e3
+        print(
+            f"{name:18}{iou(grid.occupied, truth):8.3f}{iou(matter, truth):8.3f}{iou(columns, truth):9.3f}"
+            f"{scores[0.3]:16.3f}{scores[best]:10.3f}   {opened} voxels,"
+            f" {result.timings_s['hollows']:.2f} s, {len(looks)} looks of {kilobytes:.1f} kB;"
+            f" {iou(grid.occupied, hull):.3f} -> {iou(matter, hull):.3f}, best at {best}",
+            flush=True,
+        )
+
+
 def _largest(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
     labels, count = scipy.ndimage.label(dark, np.ones((3, 3, 3), bool))
     if not count:
@@ -258,13 +377,15 @@ def _largest(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def main(argv: list[str] | None = None) -> int:
     """Run one of the measurements."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("what", choices=("fast", "search", "carve"))
-    parser.add_argument("target", nargs="*", help="for search and carve (default: all)")
+    parser.add_argument("what", choices=("fast", "search", "carve", "hollows"))
+    parser.add_argument("target", nargs="*", help="for search, carve and hollows (default: all)")
     options = parser.parse_args(argv)
     if options.what == "fast":
         fast()
     elif options.what == "search":
         search(tuple(options.target) or (*TARGETS, "empty"))
+    elif options.what == "hollows":
+        hollows(tuple(options.target) or (*HOLLOW, *SOLID))
     else:
         carve(tuple(options.target) or TARGETS)
     return 0

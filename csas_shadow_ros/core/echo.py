@@ -69,6 +69,87 @@ def _unhidden(
 
 
 @numba.njit(cache=True, nogil=True)
+def _seen(
+    opaque: BoolArray, i: int, j: int, k: int, di: float, dj: float, dk: float, lift: float
+) -> bool:  # pragma: no cover
+    """Say whether the sonar, that way, sees a voxel or one of its free faces, from `lift` voxels higher."""
+    nz, ny, nx = opaque.shape
+    if not opaque[k, j, i]:
+        return _unhidden(opaque, i, j, k + lift, di, dj, dk)
+    face = 0.52  # just outside a voxel
+    if (k + 1 >= nz or not opaque[k + 1, j, i]) and _unhidden(opaque, i, j, k + face + lift, di, dj, dk):
+        return True
+    a = 1 if di > 0 else -1
+    free = i + a < 0 or i + a >= nx or not opaque[k, j, i + a]
+    if free and _unhidden(opaque, i + face * a, j, k + lift, di, dj, dk):
+        return True
+    a = 1 if dj > 0 else -1
+    free = j + a < 0 or j + a >= ny or not opaque[k, j + a, i]
+    return free and _unhidden(opaque, i, j + face * a, k + lift, di, dj, dk)
+
+
+@numba.njit(cache=True, nogil=True)
+def count_looks(
+    voxels: NDArray[np.int32],
+    opaque: BoolArray,
+    fuller: BoolArray,
+    lift: float,
+    origin: NDArray[np.float64],
+    step: float,
+    sonar: NDArray[np.float64],
+    layover: NDArray[np.float64],
+    affine: NDArray[np.float64],
+    dark: BoolArray,
+    known: BoolArray,
+    seen: NDArray[np.int32],
+    dark_seen: NDArray[np.int32],
+) -> None:  # pragma: no cover
+    """Count a view's look at each voxel that it sees, and whether it is dark where the voxel is imaged.
+
+    Parameters
+    ----------
+    voxels : ndarray of int32, shape (n, 3)
+        (k, j, i) of opaque voxels.
+    opaque : ndarray of bool, shape (nz, ny, nx)
+        What hides.
+    fuller : ndarray of bool, shape (nz, ny, nx) or (0, 0, 0)
+        If not empty: count only looks at what this body, of which `opaque` is a part, would hide.
+    lift : float
+        A ray passes over what rises no more than this above it (voxels).
+    origin, step : ndarray, shape (3,), and float
+        (x, y, z) of voxel [0, 0, 0] and edge of a voxel, m.
+    sonar : ndarray, shape (3,)
+        Sonar position, m.
+    layover : ndarray, shape (2,)
+        tan ψ û(θ).
+    affine : ndarray, shape (2, 3)
+        Ground metres to (column, row) of `dark` and `known`.
+    dark, known : ndarray of bool, shape (rows, cols)
+        The view.
+    seen, dark_seen : ndarray of int32, shape (n,)
+        Counts, added to.
+    """
+    rows, cols = dark.shape
+    for m in range(voxels.shape[0]):
+        k, j, i = voxels[m, 0], voxels[m, 1], voxels[m, 2]
+        x, y, z = origin[0] + i * step, origin[1] + j * step, origin[2] + k * step
+        px, py = x + z * layover[0], y + z * layover[1]
+        u = math.floor(affine[0, 0] * px + affine[0, 1] * py + affine[0, 2] + 0.5)
+        v = math.floor(affine[1, 0] * px + affine[1, 1] * py + affine[1, 2] + 0.5)
+        if u < 0 or v < 0 or u >= cols or v >= rows or not known[v, u]:
+            continue
+        di, dj, dk = sonar[0] - x, sonar[1] - y, sonar[2] - z
+        length = 2.0 * max(abs(di), abs(dj), abs(dk))  # half a voxel a step
+        di, dj, dk = di / length, dj / length, dk / length
+        if not _seen(opaque, i, j, k, di, dj, dk, lift):
+            continue
+        if fuller.size and _seen(fuller, i, j, k, di, dj, dk, lift):
+            continue
+        seen[m] += 1
+        dark_seen[m] += dark[v, u]
+
+
+@numba.njit(cache=True, nogil=True)
 def _mark_echoes(
     occupied: BoolArray,
     opaque: BoolArray,
@@ -82,7 +163,6 @@ def _mark_echoes(
 ) -> None:  # pragma: no cover
     nz, ny, nx = occupied.shape
     rows, cols = out.shape
-    face = 0.52  # just outside a voxel
     for k in range(nz):
         for j in range(ny):
             for i in range(nx):
@@ -92,19 +172,7 @@ def _mark_echoes(
                 di, dj, dk = sonar[0] - x, sonar[1] - y, sonar[2] - z
                 length = 2.0 * max(abs(di), abs(dj), abs(dk))  # half a voxel a step
                 di, dj, dk = di / length, dj / length, dk / length
-                if not opaque[k, j, i]:
-                    seen = _unhidden(opaque, i, j, k, di, dj, dk)
-                else:
-                    seen = False
-                    if k + 1 >= nz or not opaque[k + 1, j, i]:
-                        seen = _unhidden(opaque, i, j, k + face, di, dj, dk)
-                    a = 1 if di > 0 else -1
-                    if not seen and (i + a < 0 or i + a >= nx or not opaque[k, j, i + a]):
-                        seen = _unhidden(opaque, i + face * a, j, k, di, dj, dk)
-                    a = 1 if dj > 0 else -1
-                    if not seen and (j + a < 0 or j + a >= ny or not opaque[k, j + a, i]):
-                        seen = _unhidden(opaque, i, j + face * a, k, di, dj, dk)
-                if not seen:
+                if not _seen(opaque, i, j, k, di, dj, dk, 0.0):
                     continue
                 px, py = x + z * layover[0], y + z * layover[1]
                 u = math.floor(affine[0, 0] * px + affine[0, 1] * py + affine[0, 2] + 0.5)

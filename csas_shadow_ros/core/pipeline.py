@@ -14,12 +14,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TypeVar
 
+import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from .carving import Carver
 from .composites import Composites
 from .errors import ViewError
 from .geometry import CoherentImage, Track, View
+from .hollows import EchoLook, matter_mesh, matter_of
 from .likelihood import Levels, outside_likelihood, view_levels
 from .measurement import SilhouetteSides, measure_object, silhouette_sides
 from .mesh import Dimensions, mesh_from_grid
@@ -44,6 +47,7 @@ class ProcessedView:
     likelihood: View
     mask: View
     sides: SilhouetteSides | None
+    look: EchoLook
 
 
 @dataclass(eq=False)
@@ -60,6 +64,10 @@ class Result:
         By the chosen method, and by the other one.
     mesh, dimensions : trimesh.Trimesh, Dimensions or None
         Surface and measures of the object.
+    matter : ndarray of bool, shape (nz, ny, nx), or None
+        The grid's object without the hollows that its echoes show; None where no echo was looked at.
+    matter_mesh : trimesh.Trimesh or None
+        Its surface: `mesh` itself where there is no hollow.
     composites : Composites
         Multi-look and colour-by-aspect images.
     views_used : int
@@ -70,6 +78,8 @@ class Result:
         (σ_r, contrast, estimated) of each view, by stamp.
     sides : list of SilhouetteSides
         Where the shadow ends in each view: what the dimensions are measured on.
+    looks : dict of EchoLook
+        Where each view is dark round the target, by stamp: what hollows are told by.
     timings_s : dict
         Seconds of wall time by step.
     """
@@ -80,11 +90,14 @@ class Result:
     other_grid: VoxelGrid | None = None
     mesh: trimesh.Trimesh | None = None
     dimensions: Dimensions | None = None
+    matter: NDArray[np.bool_] | None = None
+    matter_mesh: trimesh.Trimesh | None = None
     composites: Composites | None = None
     views_used: int = 0
     rejected: dict[float, str] = field(default_factory=dict)
     levels: dict[int, tuple[float, float, bool]] = field(default_factory=dict)
     sides: list[SilhouetteSides] = field(default_factory=list)
+    looks: dict[int, EchoLook] = field(default_factory=dict)
     timings_s: dict[str, float] = field(default_factory=dict)
 
 
@@ -100,7 +113,9 @@ def process_view(
         shadow, target.position_m, p.likelihood, levels, reach_m=target.reach_m
     )  # 4.1 silhouette
     sides = silhouette_sides(levels, mask, target.position_m)
-    return ProcessedView(sub_aperture, shadow, levels, likelihood, mask, sides)
+    volume = Volume.around(target.position_m, target.size_m, p.carving.voxel_size_m)
+    look = EchoLook.of(levels, shadow.info, volume)  # beyond the paper: hollows
+    return ProcessedView(sub_aperture, shadow, levels, likelihood, mask, sides, look)
 
 
 def run(
@@ -190,7 +205,19 @@ def run(
             result.mesh = mesh_from_grid(result.grid)
             result.dimensions = measure_object(result.grid, result.mesh, result.sides)
     lap("shape")
+    open_hollows(result)
+    lap("hollows")
     return result
+
+
+def open_hollows(result: Result) -> None:
+    """Tell the matter in a result's grid from hollows that no shadow shows; the grid stays as it is."""
+    grid = result.grid
+    if grid is None or result.mesh is None or not result.looks:
+        return
+    result.matter = matter_of(grid, result.looks.values())
+    hollow = bool((grid.occupied & ~result.matter).any())
+    result.matter_mesh = matter_mesh(grid, result.matter) if hollow else result.mesh
 
 
 def _carvers(target: Target, parameters: CarvingParameters) -> list[Carver]:
@@ -224,6 +251,7 @@ def _integrate(result: Result, carvers: list[Carver], view: ProcessedView) -> No
         result.sides.append(view.sides)
     levels = view.levels
     result.levels[view.shadow.info.stamp_ns] = (levels.seabed_level, levels.contrast, levels.estimated)
+    result.looks[view.shadow.info.stamp_ns] = view.look
 
 
 def in_order(function: Callable[[In], Out], items: Iterable[In], workers: int) -> Iterator[tuple[In, Out]]:

@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 from .carving import Carver
 from .errors import NoTargetError, ParameterError, ViewError
 from .geometry import TWO_PI, View, fit_target_to_focus, wrap_angle
+from .hollows import EchoLook
 from .likelihood import Levels, outside_likelihood, view_levels
 from .measurement import SilhouetteSides, levels_of_mask, measure_object, silhouette_sides
 from .mesh import mesh_from_grid
 from .parameters import PipelineParameters, ShadowParameters, TargetParameters
-from .pipeline import Result, compose, in_order
+from .pipeline import Result, compose, in_order, open_hollows
 from .segmentation import require_silhouette, segment_shadow
 from .shadow import enhance
 from .target import Search, Target, choose_target, search_views
@@ -41,6 +42,7 @@ class StagedView:
     likelihood: View | None = None
     mask: View | None = None
     sides: SilhouetteSides | None = None
+    look: EchoLook | None = None
 
 
 def spread_views(views: Iterable[View], count: int, start_rad: float = 0.0) -> list[View]:
@@ -136,7 +138,9 @@ def stage_view(view: View, stage: str, target: Target, p: PipelineParameters) ->
     likelihood = outside_likelihood(shadow, p.likelihood, levels)
     mask = segment_shadow(shadow, target.position_m, p.likelihood, levels, reach_m=target.reach_m)  # 4.1
     sides = silhouette_sides(levels, mask, target.position_m)
-    return StagedView(sub_aperture, shadow, levels, likelihood, mask, sides)
+    volume = Volume.around(target.position_m, target.size_m, p.carving.voxel_size_m)
+    look = EchoLook.of(levels, shadow.info, volume)
+    return StagedView(sub_aperture, shadow, levels, likelihood, mask, sides, look)
 
 
 def run_views(
@@ -233,6 +237,8 @@ def run_views(
             result.mesh = mesh_from_grid(result.grid)
             result.dimensions = measure_object(result.grid, result.mesh, result.sides)
     lap("shape")
+    open_hollows(result)
+    lap("hollows")
     return result
 
 
@@ -267,3 +273,5 @@ def _integrate(result: Result, carvers: list[Carver], staged: StagedView, view: 
         levels = staged.levels
         stamp = view.info.stamp_ns
         result.levels[stamp] = (levels.seabed_level, levels.contrast, levels.estimated)
+    if staged.look is not None:
+        result.looks[view.info.stamp_ns] = staged.look

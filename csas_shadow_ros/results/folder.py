@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from ..bags import BagReader
 from ..core.errors import CsasError
@@ -27,6 +28,8 @@ from .truth import score
 
 REPORT = "report.json"
 GRID = "grid.npz"
+#: The surface of the matter alone, where echoes show a hollow.
+MATTER_MESH = "mesh_matter.stl"
 MESH_FORMATS = ("stl", "ply", "obj", "glb")
 #: Streams of the bag, and where a processed view has them.
 _STREAMS = {
@@ -184,9 +187,11 @@ class ResultsWriter:
             start = time.perf_counter()
 
         work = self._work
-        write_grid(work / GRID, result.grid or _unknown_grid(result, context))
+        write_grid(work / GRID, result.grid or _unknown_grid(result, context), result.matter)
         if result.mesh is not None:
             write_meshes(work, result.mesh)
+        if result.matter_mesh is not None and result.matter_mesh is not result.mesh:
+            _write_mesh(work / MATTER_MESH, result.matter_mesh)
         if self._bag is not None:
             self._bag.finish(result)
         lap("write")
@@ -205,7 +210,7 @@ class ResultsWriter:
             lap("figures")
         scores = None
         if truth is not None and truth.dimensions is not None and result.grid is not None and self._sonar_m:
-            scores = score(truth, result.grid, np.array(list(self._sonar_m.values())))
+            scores = score(truth, result.grid, np.array(list(self._sonar_m.values())), result.matter)
             lap("scores")
         other = result.other_grid
         other_dimensions = (
@@ -234,12 +239,16 @@ class ResultsWriter:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def write_grid(path: Path, grid: VoxelGrid) -> None:
-    """Write ``grid.npz``: likelihood, occupied, views (nz, ny, nx), origin_m, voxel_size_m, threshold."""
+def write_grid(path: Path, grid: VoxelGrid, matter: NDArray[np.bool_] | None = None) -> None:
+    """Write ``grid.npz``: likelihood, occupied, views (nz, ny, nx), origin_m, voxel_size_m, threshold.
+
+    And ``matter`` (nz, ny, nx): where no echo was looked at, all that is occupied.
+    """
     np.savez_compressed(
         path,
         likelihood=grid.likelihood.astype(np.float32, copy=False),
         occupied=grid.occupied.astype(bool, copy=False),
+        matter=(grid.occupied if matter is None else matter).astype(bool, copy=False),
         views=grid.views,
         origin_m=np.asarray(grid.volume.origin_m, dtype=np.float64),
         voxel_size_m=np.float64(grid.volume.voxel_size_m),
@@ -268,14 +277,19 @@ def write_meshes(folder: Path, mesh: trimesh.Trimesh) -> list[str]:
     """Write ``mesh.stl``, ``.ply``, ``.obj`` and ``.glb``; metres, scene frame, z up in all of them."""
     names = []
     for kind in MESH_FORMATS:
-        data: Any = mesh.export(file_type=kind)
         path = folder / f"mesh.{kind}"
-        if isinstance(data, str):
-            path.write_text(data, encoding="utf-8")
-        else:
-            path.write_bytes(data)
+        _write_mesh(path, mesh)
         names.append(path.name)
     return names
+
+
+def _write_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
+    """Write a mesh in the format that the file's name ends with."""
+    data: Any = mesh.export(file_type=path.suffix[1:])
+    if isinstance(data, str):
+        path.write_text(data, encoding="utf-8")
+    else:
+        path.write_bytes(data)
 
 
 def is_results_folder(folder: str | Path) -> bool:

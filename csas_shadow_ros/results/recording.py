@@ -17,10 +17,11 @@ from ..bags import BagReader, Run, read_run
 from ..core.carving import Carver, KeptMask
 from ..core.errors import ViewError
 from ..core.geometry import GroundGrid, View
+from ..core.hollows import EchoLook
 from ..core.likelihood import view_levels
 from ..core.measurement import levels_of_mask, measure_object, silhouette_sides
 from ..core.parameters import PipelineParameters
-from ..core.pipeline import Result
+from ..core.pipeline import Result, open_hollows
 from ..core.segmentation import require_silhouette
 from ..core.stages import StagedView, spread_views
 from .figures import SIX_ASPECTS_DEG
@@ -59,7 +60,7 @@ def adopt_replay(writer: ResultsWriter, replayed: ReplayResult, parameters: Pipe
     """Turn what a replay left, and its recording, into what the in-process pipeline would have left.
 
     The grid, mesh, target and composites are the graph's own. The other method's grid (figure 8) is
-    carved from the recorded views.
+    carved from the recorded views, and hollows are told from their echoes.
 
     Parameters
     ----------
@@ -131,6 +132,7 @@ def _adopt_views(writer: ResultsWriter, run: Run, result: Result, p: PipelinePar
                 if stage == "shadow":
                     levels = view_levels(view, p.likelihood)
                     result.levels[stamp] = (levels.seabed_level, levels.contrast, levels.estimated)
+                    result.looks[stamp] = EchoLook.of(levels, view.info, result.grid.volume)
                     if result.target is not None and stamp in masks:
                         mask = masks.pop(stamp).view()
                         sides = silhouette_sides(levels, mask, result.target.position_m)
@@ -159,6 +161,7 @@ def _adopt_views(writer: ResultsWriter, run: Run, result: Result, p: PipelinePar
             result.sides += [sides] if sides is not None else []
     if result.mesh is not None:
         result.dimensions = measure_object(result.grid, result.mesh, result.sides)
+    open_hollows(result)
 
 
 def node_table(replayed: ReplayResult) -> dict[str, Any]:

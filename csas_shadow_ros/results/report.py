@@ -128,6 +128,21 @@ def _grid(grid: VoxelGrid | None) -> dict[str, Any] | None:
     }
 
 
+def _hollows(result: Result, scores: Mapping[str, float] | None) -> dict[str, Any] | None:
+    """Say how much of the carved object its echoes show to be empty; None where none was looked at."""
+    if result.grid is None or result.matter is None:
+        return None
+    voxels = int(np.count_nonzero(result.grid.occupied & ~result.matter))
+    known = None
+    if scores is not None and "iou_matter" in scores:
+        known = {"occupied": scores["iou_truth"], "matter": scores["iou_matter"]}
+    return {
+        "voxels": voxels,
+        "volume_m3": voxels * result.grid.volume.voxel_size_m**3,
+        "iou_truth": known,
+    }
+
+
 #: Thresholds that the sensitivity curve is made at, as multiples of the one that was used.
 _SENSITIVITY = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 
@@ -270,6 +285,7 @@ def build_report(
         "shadow_heights": _shadow_heights(result),
         "target": result.target,
         "grid": _grid(result.grid),
+        "hollows": _hollows(result, scores),
         "other_method": {"grid": _grid(result.other_grid), "dimensions": _dimensions(other)},
         "truth": truth,
         "views": {
@@ -371,6 +387,12 @@ def summary(report: Mapping[str, Any]) -> str:
             f"IoU against the truth {s['iou_truth']:.3f}, against its shadow hull {s['iou_hull']:.3f}"
             f" (the hull itself: {s['iou_hull_truth']:.3f})"
         )
+    hollows = report.get("hollows")
+    if hollows and hollows["voxels"]:
+        line = f"hollows that no shadow shows, but echoes do: {hollows['volume_m3']:.4f} m³"
+        if iou_truth := hollows["iou_truth"]:
+            line += f"; without them, IoU against the truth {iou_truth['matter']:.3f}"
+        lines.append(line)
     grid, views = report["grid"], report["views"]
     if grid:
         threshold = "none" if grid["threshold"] is None else f"{grid['threshold']:.4f}"

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import CsasError
 from ..core.mesh import Dimensions, measure
@@ -79,7 +79,9 @@ def read_truth(bag: str | Path) -> KnownTruth | None:
     return KnownTruth(stl, mesh, record)
 
 
-def score(truth: KnownTruth, grid: VoxelGrid, sonar_m: ArrayLike) -> dict[str, float]:
+def score(
+    truth: KnownTruth, grid: VoxelGrid, sonar_m: ArrayLike, matter: NDArray[np.bool_] | None = None
+) -> dict[str, float]:
     """Compare a reconstruction with the truth and with the truth's shadow hull.
 
     The shadow hull, which perfect silhouettes from the same sonar positions would leave, is the best that
@@ -93,26 +95,36 @@ def score(truth: KnownTruth, grid: VoxelGrid, sonar_m: ArrayLike) -> dict[str, f
         The reconstruction.
     sonar_m : array_like, shape (n, 3)
         Where the sonar was for the views in the grid.
+    matter : ndarray of bool, shape (nz, ny, nx), optional
+        The reconstruction without its hollows.
 
     Returns
     -------
     dict
-        ``iou_truth``, ``iou_hull``, ``iou_hull_truth``.
+        ``iou_truth``, ``iou_hull``, ``iou_hull_truth``; with matter also ``iou_matter``.
     """
     volume, before = _widened(grid.volume, truth.mesh)
-    occupied = np.zeros(volume.shape, bool)
     nz, ny, nx = grid.volume.shape
     z, y, x = before
-    occupied[z : z + nz, y : y + ny, x : x + nx] = grid.occupied
+
+    def widened(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        out = np.zeros(volume.shape, bool)
+        out[z : z + nz, y : y + ny, x : x + nx] = voxels
+        return out
+
+    occupied = widened(grid.occupied)
     solid = voxelise_truth(truth.mesh, volume)
     positions = np.asarray(sonar_m, dtype=np.float64)
     # Half a voxel is far finer than what the hull is compared with.
     hull = shadow_hull(truth.mesh, positions, volume, spacing_m=min(grid.volume.voxel_size_m / 2, 10.0))
-    return {
+    scores = {
         "iou_truth": iou(occupied, solid),
         "iou_hull": iou(occupied, hull),
         "iou_hull_truth": iou(hull, solid),
     }
+    if matter is not None:
+        scores["iou_matter"] = iou(widened(matter), solid)
+    return scores
 
 
 def _widened(volume: Volume, mesh: trimesh.Trimesh) -> tuple[Volume, tuple[int, int, int]]:

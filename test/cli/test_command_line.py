@@ -134,8 +134,11 @@ def test_simulating_twice_with_one_seed_gives_the_same_bytes_and_never_replaces_
 
 def test_the_grid_has_the_documented_arrays_and_they_agree_with_each_other(results):
     with np.load(results / "grid.npz") as grid:
-        assert set(grid.files) == {"likelihood", "occupied", "views", "origin_m", "voxel_size_m", "threshold"}
+        assert set(grid.files) == {
+            "likelihood", "occupied", "matter", "views", "origin_m", "voxel_size_m", "threshold",
+        }  # fmt: skip
         likelihood, occupied, views = grid["likelihood"], grid["occupied"], grid["views"]
+        assert not (grid["matter"] & ~occupied).any()
         origin, size, threshold = grid["origin_m"], float(grid["voxel_size_m"]), float(grid["threshold"])
     assert likelihood.dtype == np.float32
     assert occupied.dtype == bool
@@ -268,6 +271,29 @@ def test_recorded_masks_carve_the_same_grid_as_the_run_that_made_them(results, t
     with np.load(results / "grid.npz") as a, np.load(tmp_path / "r" / "grid.npz") as b:
         for name in a.files:
             assert np.array_equal(a[name], b[name], equal_nan=True), name
+
+
+def test_a_hollow_is_told_of_in_the_grid_the_report_the_summary_and_a_surface_of_its_own(tmp_path):
+    bag, out = tmp_path / "tyre", tmp_path / "r"
+    assert Said("simulate", bag, "--profile", "tiny", "--target", "tyre", "--seed", "5").code == 0
+    said = run_quickly(bag, out, "--step-deg", "5")
+    assert said.code == 0, said.err
+    hollows = said.json["hollows"]
+    with np.load(out / "grid.npz") as grid:
+        assert np.count_nonzero(grid["occupied"] & ~grid["matter"]) == hollows["voxels"] > 0
+        assert hollows["volume_m3"] == pytest.approx(hollows["voxels"] * float(grid["voxel_size_m"]) ** 3)
+    assert hollows["iou_truth"]["occupied"] == said.json["truth"]["scores"]["iou_truth"]
+    assert hollows["iou_truth"]["matter"] > hollows["iou_truth"]["occupied"]
+    assert "hollows that no shadow shows" in (out / "summary.txt").read_text(encoding="utf-8")
+    assert "mesh_matter.stl" in said.json["files"]
+    whole, matter = (trimesh.load(out / f"{name}.stl").volume for name in ("mesh", "mesh_matter"))
+    assert 0.0 < matter < whole
+
+
+def test_without_a_hollow_there_is_one_surface_alone(results):
+    assert read_report(results)["hollows"]["voxels"] == 0
+    assert not (results / "mesh_matter.stl").exists()
+    assert "hollows" not in (results / "summary.txt").read_text(encoding="utf-8")
 
 
 def test_masks_alone_without_a_given_target_are_refused_with_what_to_give(results, tmp_path):
