@@ -187,6 +187,10 @@ class ResultsWriter:
         write_grid(work / GRID, result.grid or _unknown_grid(result, context))
         if result.mesh is not None:
             write_meshes(work, result.mesh)
+        for number, one in enumerate(result.objects, start=1):
+            if number > 1 or result.mesh is None:  # grid.npz and mesh.* are the target's
+                write_grid(work / f"object_{number}.npz", one.grid)
+                one.mesh.export(str(work / f"object_{number}.stl"))
         if self._bag is not None:
             self._bag.finish(result)
         lap("write")
