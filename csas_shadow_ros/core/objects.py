@@ -31,7 +31,7 @@ from .target import Search, Target, stands_on_seabed
 from .threshold import LEAST_VOXELS
 from .volume import Volume, VoxelGrid
 
-#: Bodies carved if nothing else is asked for, the target among them. Each further one takes about two thirds
+#: Bodies carved if nothing else is asked for, the target among them. Each further one takes about half
 #: of the target's time.
 MAX_OBJECTS = 4
 #: More than this are refused: their views would not fit into memory.
