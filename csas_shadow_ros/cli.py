@@ -351,6 +351,7 @@ def _add_simulate(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
+    from .core.objects import MAX_OBJECTS, MOST_OBJECTS
     from .process import START_FROM
 
     p = add(
@@ -361,7 +362,8 @@ def _add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
         "  csas-shadow run box_run --out by_hand --position-m 0.5 -0.3 --size-m 2 2 0.8\n"
         "  csas-shadow run other_run --out flipped --spectrum-sign -1\n"
         "  csas-shadow run views --out carved --start-from likelihood --target given --size-m 2 2 0.8\n\n"
-        "DIR holds grid.npz, mesh.stl .ply .obj .glb, report.json, summary.txt, result.mcap and figures/.\n"
+        "DIR holds grid.npz, mesh.stl .ply .obj .glb, report.json, summary.txt, result.mcap and figures/,\n"
+        "and object_2.npz, object_2.stl and so on of what else stands on the seabed.\n"
         "A seabed without an object is a result like any other: it is said so, and the exit code is 0.",
         _run,
     )
@@ -381,6 +383,14 @@ def _add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
         help="instead of the one that the bag states",
     )
     p.add_argument("--workers", type=int, default=2, metavar="N", help="threads (default 2)")
+    p.add_argument(
+        "--max-objects",
+        type=int,
+        default=MAX_OBJECTS,
+        metavar="N",
+        help="bodies of an image that are carved, the target among them; the target's result does not depend"
+        f" on it (1 to {MOST_OBJECTS}; default {MAX_OBJECTS})",
+    )
     _results_options(p)
     _parameter_options(p)
     _common(p)
@@ -594,6 +604,7 @@ def _run(arguments: argparse.Namespace, console: Console) -> int:
             write_bag=not arguments.no_bag,
             figures=not arguments.no_figures,
             workers=arguments.workers,
+            max_objects=arguments.max_objects,
             command=arguments.command_line,
             progress=bar,
             notice=console.notice,

@@ -16,6 +16,7 @@ from .bags import BagReader, Problem, Run, read_run
 from .bags.check import ERROR, judge_amplitude, judge_coverage, judge_image
 from .core.errors import BagError, CsasError, ParameterError, SpectrumSignError
 from .core.geometry import CoherentImage, Track, View
+from .core.objects import MAX_OBJECTS
 from .core.parameters import PipelineParameters
 from .core.pipeline import Result
 from .core.pipeline import run as run_pipeline
@@ -45,11 +46,12 @@ def process_bag(
     write_bag: bool = True,
     figures: bool = True,
     workers: int = 2,
+    max_objects: int = MAX_OBJECTS,
     command: Sequence[str] = (),
     progress: Progress | None = None,
     notice: Notice = _ignore,
 ) -> dict[str, Any]:
-    """Reconstruct the target of a bag and write its results folder.
+    """Reconstruct what a bag shows and write its results folder.
 
     Parameters
     ----------
@@ -69,6 +71,9 @@ def process_bag(
         See `ResultsWriter`.
     workers : int
         Threads.
+    max_objects : int
+        At most so many bodies are carved, the target among them (see `pipeline.run`). Starting from views,
+        which were made for one target, it is the only one.
     command : sequence of str
         Command line, for the report.
     progress : callable, optional
@@ -95,7 +100,7 @@ def process_bag(
         context = Context(p, command, stage=stage, truth=truth, spectrum_sign_override=spectrum_sign)
         context.timings_s["read"] = time.perf_counter() - began
         if stage == "image":
-            result = _from_image(run, context, writer, workers, progress, notice)
+            result = _from_image(run, context, writer, workers, max_objects, progress, notice)
         else:
             result = _from_views(run, context, writer, workers, progress, notice)
         context.timings_s["write_views"] = writer.view_seconds
@@ -216,7 +221,13 @@ def choose_start(run: Run, start_from: str = "auto") -> str:
 
 
 def _from_image(
-    run: Run, context: Context, writer: ResultsWriter, workers: int, progress: Progress | None, notice: Notice
+    run: Run,
+    context: Context,
+    writer: ResultsWriter,
+    workers: int,
+    max_objects: int,
+    progress: Progress | None,
+    notice: Notice,
 ) -> Result:
     began = time.perf_counter()
     image, track = run.coherent_image(), run.require_track()
@@ -233,7 +244,13 @@ def _from_image(
     writer.write_source(image, track, BagReader(run.path, run.namespace) if as_recorded else None)
     try:
         result = run_pipeline(
-            image, track, context.parameters, progress=progress, on_view=writer.add_view, workers=workers
+            image,
+            track,
+            context.parameters,
+            progress=progress,
+            on_view=writer.add_view,
+            workers=workers,
+            max_objects=max_objects,
         )
     except SpectrumSignError as error:
         raise SpectrumSignError(

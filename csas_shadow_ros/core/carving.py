@@ -222,7 +222,7 @@ class Carver:
 
     def _second_look(self, first: VoxelGrid) -> VoxelGrid:
         """Carve again what the first look left, with the pixels that its own echo cannot cover as seabed."""
-        box, part = _box_around(first.occupied, self.volume, _SECOND_LOOK_VOXELS)
+        box, part = part_around(first.occupied, self.volume, _SECOND_LOOK_VOXELS)
         body = first.occupied[box]
         total, count = np.zeros(part.shape, np.int32), np.zeros(part.shape, np.uint16)
         opaque: dict[int, NDArray[np.bool_]] = {}
@@ -271,7 +271,7 @@ def _mean(
     return np.where(count >= least, mean, np.float32(np.nan)).astype(np.float32)
 
 
-def _box_around(occupied: NDArray[np.bool_], volume: Volume, margin: int) -> tuple[tuple[slice, ...], Volume]:
+def part_around(occupied: NDArray[np.bool_], volume: Volume, margin: int) -> tuple[tuple[slice, ...], Volume]:
     """Return the part of a volume round its occupied voxels."""
     box = []
     for axis in range(3):

@@ -20,17 +20,26 @@ from numpy.typing import NDArray
 
 from .carving import Carver
 from .composites import Composites
-from .errors import ViewError
+from .errors import ViewError, check_range
 from .geometry import CoherentImage, Track, View
 from .hollows import EchoLook, matter_mesh, matter_of
 from .likelihood import Levels, outside_likelihood, view_levels
 from .measurement import SilhouetteSides, measure_object, silhouette_sides
 from .mesh import Dimensions, mesh_from_grid
+from .objects import (
+    MAX_OBJECTS,
+    MOST_OBJECTS,
+    FurtherBody,
+    FurtherView,
+    LeftOut,
+    ObjectResult,
+    further_targets,
+)
 from .parameters import CarvingParameters, PipelineParameters
 from .segmentation import require_silhouette, segment_shadow
 from .shadow import enhance
 from .subaperture import Spectrum, SubApertures
-from .target import SignEvidence, Target, choose_target, find_target, spectrum_sign_evidence
+from .target import SignEvidence, Target, choose_target, find_target_and_others, spectrum_sign_evidence
 from .volume import Volume, VoxelGrid
 
 In = TypeVar("In")
@@ -80,6 +89,10 @@ class Result:
         Where the shadow ends in each view: what the dimensions are measured on.
     looks : dict of EchoLook
         Where each view is dark round the target, by stamp: what hollows are told by.
+    further : list of ObjectResult
+        What else stands on the seabed, in the order of the search's evidence.
+    left_out : list of LeftOut
+        Bodies of the search that are no objects, and why.
     timings_s : dict
         Seconds of wall time by step.
     """
@@ -98,7 +111,17 @@ class Result:
     levels: dict[int, tuple[float, float, bool]] = field(default_factory=dict)
     sides: list[SilhouetteSides] = field(default_factory=list)
     looks: dict[int, EchoLook] = field(default_factory=dict)
+    further: list[ObjectResult] = field(default_factory=list)
+    left_out: list[LeftOut] = field(default_factory=list)
     timings_s: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def objects(self) -> list[ObjectResult]:
+        """Every object, the target first (unless its carving left none)."""
+        if self.target is None or self.grid is None or self.mesh is None or self.dimensions is None:
+            return list(self.further)
+        main = ObjectResult(self.target, self.grid, self.mesh, self.dimensions, self.views_used)
+        return [main, *self.further]
 
 
 def process_view(
@@ -126,8 +149,9 @@ def run(
     progress: Callable[[int, int], None] | None = None,
     on_view: Callable[[ProcessedView], None] | None = None,
     workers: int = 2,
+    max_objects: int = MAX_OBJECTS,
 ) -> Result:
-    """Reconstruct the target of a circular run from its shadows.
+    """Reconstruct the target of a circular run, and what else stands there, from their shadows.
 
     Parameters
     ----------
@@ -143,6 +167,9 @@ def run(
         Called with every processed view, in order of aspect, to keep or show it.
     workers : int
         Threads.
+    max_objects : int
+        At most so many bodies of the search are carved, the target among them; nothing of the target's
+        result depends on it. A target whose position is given is the only one.
 
     Returns
     -------
@@ -151,12 +178,15 @@ def run(
 
     Raises
     ------
+    ParameterError
+        If `max_objects` is out of range.
     SpectrumSignError
         If the shadows contradict the stated spectrum sign.
     NoTargetError
         If a target position was given and nothing is there.
     """
     p = parameters or PipelineParameters()
+    check_range("max_objects", max_objects, 1, MOST_OBJECTS)
     result, start = Result(), time.perf_counter()
 
     def lap(step: str) -> None:
@@ -169,24 +199,27 @@ def run(
         result.sign.check()
         result.target = choose_target(search, p.target)
     else:
-        result.target = find_target(image, track, p.target, spectrum=spectrum)
+        result.target, search = find_target_and_others(image, track, p.target, spectrum=spectrum)
+    others: list[Target] = []
+    if search is not None and p.target.target == "auto":
+        others, result.left_out = further_targets(search, max_objects)
+    further = [FurtherBody(body, p) for body in others]
     lap("target")
     sub_apertures = SubApertures(image, track, p.sub_aperture, spectrum=spectrum)
     target = result.target
     carvers = _carvers(target, p.carving) if target else []
 
-    def make(aspect: float) -> ProcessedView | View | ViewError:
+    def make(aspect: float) -> tuple[ProcessedView | View | ViewError, list[FurtherView | ViewError]]:
         try:
-            return (
-                process_view(sub_apertures, aspect, target, p)
-                if target
-                else sub_apertures.view_of_aspect(aspect)
-            )
+            if target is None:
+                return sub_apertures.view_of_aspect(aspect), []
+            view = process_view(sub_apertures, aspect, target, p)
         except ViewError as error:
-            return error
+            return error, []
+        return view, [body.process(view.sub_aperture) for body in further]
 
     aspects = [float(a) for a in sub_apertures.aspects_rad]
-    for done, (aspect, view) in enumerate(in_order(make, aspects, workers), start=1):
+    for done, (aspect, (view, of_others)) in enumerate(in_order(make, aspects, workers), start=1):
         if isinstance(view, ViewError):
             result.rejected[round(math.degrees(aspect), 6)] = str(view)
         elif isinstance(view, View):
@@ -194,6 +227,8 @@ def run(
         else:
             compose(result, view.sub_aperture)
             _integrate(result, carvers, view)
+            for body, one in zip(further, of_others, strict=True):
+                body.integrate(one)
             if on_view:
                 on_view(view)
         if progress:
@@ -207,6 +242,9 @@ def run(
     lap("shape")
     open_hollows(result)
     lap("hollows")
+    if further:
+        _add_objects(result, further)
+        lap("objects")
     return result
 
 
@@ -218,6 +256,14 @@ def open_hollows(result: Result) -> None:
     result.matter = matter_of(grid, result.looks.values())
     hollow = bool((grid.occupied & ~result.matter).any())
     result.matter_mesh = matter_mesh(grid, result.matter) if hollow else result.mesh
+
+
+def _add_objects(result: Result, further: list[FurtherBody]) -> None:
+    """Add what the further bodies turned out to be, each without what was reported before it."""
+    for body in further:
+        found, left_out = body.objects([o.grid for o in result.objects])
+        result.further += found
+        result.left_out += left_out
 
 
 def _carvers(target: Target, parameters: CarvingParameters) -> list[Carver]:

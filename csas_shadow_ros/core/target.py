@@ -59,16 +59,29 @@ class Target:
         Size (x, y, z) of the volume to carve, margin included.
     evidence : float
         Sum of height over the body's voxels, m⁴: large for a large, high body.
+    stands : bool
+        Whether the body rests on the seabed (`stands_on_seabed`).
     """
 
     position_m: tuple[float, float]
     size_m: tuple[float, float, float]
     evidence: float = math.nan
+    stands: bool = True
 
     @property
     def reach_m(self) -> float:
         """Distance from the middle within which the target's own shadows begin (margin excluded)."""
         return 0.5 * math.hypot(self.size_m[0], self.size_m[1]) / (1.0 + 2.0 * _MARGIN_SHARE)
+
+
+def stands_on_seabed(bottom_m: float, top_m: float) -> bool:
+    """Say whether a body that reaches from one height to another rests on the seabed.
+
+    The shadows of several bodies cross, and high over the seabed between them a voxel's shadow may fall into
+    one of these from nearly every side. Such a phantom has nothing under it. A body's lowest voxels may be
+    lost in its own echo, but not more than that: it does not hang higher than it is high itself.
+    """
+    return bottom_m <= top_m - bottom_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +173,7 @@ def _bodies(likelihood: NDArray[np.float32], volume: Volume) -> list[Target]:
                 (float(middle[0]), float(middle[1])),
                 (float(full[0]), float(full[1]), float(top + max(_MARGIN_SHARE * top, 2 * d))),
                 evidence,
+                stands_on_seabed(float(z[0]) - d / 2, top),
             )
         )
     return sorted(found, key=lambda target: -target.evidence)
@@ -201,12 +215,31 @@ def find_target(
     Target or None
         None: there is no object.
     """
+    return find_target_and_others(image, track, parameters, spectrum=spectrum)[0]
+
+
+def find_target_and_others(
+    image: CoherentImage,
+    track: Track,
+    parameters: TargetParameters | None = None,
+    *,
+    spectrum: Spectrum | None = None,
+) -> tuple[Target | None, Search | None]:
+    """Find the target as `find_target` does, and return the search that it was found in.
+
+    Returns
+    -------
+    Target or None
+        None: there is no object.
+    Search or None
+        None: the target was given whole, or there was no view to look in.
+    """
     p = parameters or TargetParameters()
     size = p.size_m
     if p.target == "given" and all(s > 0 for s in size):
-        return Target((p.position_m[0], p.position_m[1]), (size[0], size[1], size[2]))
+        return Target((p.position_m[0], p.position_m[1]), (size[0], size[1], size[2])), None
     search = _search_image(image, track, spectrum or Spectrum.of_image(image))
-    return choose_target(search, p)
+    return choose_target(search, p), search
 
 
 def choose_target(search: Search | None, parameters: TargetParameters) -> Target | None:

@@ -32,7 +32,7 @@ _DARKEST = 27
 #: Pieces of less than this fraction of the largest piece are noise.
 _PIECE = 0.05
 #: An object has at least this many voxels in its largest piece; fewer are noise, and no object.
-_LEAST_VOXELS = 27
+LEAST_VOXELS = 27
 
 
 def object_threshold(likelihood: NDArray[np.float32], method: str) -> float:
@@ -134,7 +134,7 @@ def occupied_voxels(
     labels, count = scipy.ndimage.label(body, np.ones((3, 3, 3), bool))
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     sizes[0] = 0
-    if sizes.max() < _LEAST_VOXELS:
+    if sizes.max() < LEAST_VOXELS:
         return np.zeros(likelihood.shape, bool)
     return np.asarray((sizes >= _PIECE * sizes.max())[labels] & body)
 

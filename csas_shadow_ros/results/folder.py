@@ -192,6 +192,10 @@ class ResultsWriter:
             write_meshes(work, result.mesh)
         if result.matter_mesh is not None and result.matter_mesh is not result.mesh:
             _write_mesh(work / MATTER_MESH, result.matter_mesh)
+        for number, one in enumerate(result.objects, start=1):
+            if number > 1 or result.mesh is None:  # grid.npz and mesh.* are the target's
+                write_grid(work / f"object_{number}.npz", one.grid)
+                one.mesh.export(str(work / f"object_{number}.stl"))
         if self._bag is not None:
             self._bag.finish(result)
         lap("write")

@@ -143,6 +143,28 @@ def _hollows(result: Result, scores: Mapping[str, float] | None) -> dict[str, An
     }
 
 
+def _objects(result: Result) -> list[dict[str, Any]]:
+    """Return one entry an object, the target first."""
+    entries = []
+    for number, one in enumerate(result.objects, start=1):
+        # The first object is the target, unless its carving left none.
+        of_target = number == 1 and result.mesh is not None
+        entries.append(
+            {
+                "number": number,
+                "position_m": one.dimensions.position_m,
+                "dimensions": _dimensions(one.dimensions),
+                "target": one.target,
+                "grid": _grid(one.grid),
+                "views_used": one.views_used,
+                "files": ["grid.npz", "mesh.stl"]
+                if of_target
+                else [f"object_{number}.npz", f"object_{number}.stl"],
+            }
+        )
+    return entries
+
+
 #: Thresholds that the sensitivity curve is made at, as multiples of the one that was used.
 _SENSITIVITY = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 
@@ -278,6 +300,8 @@ def build_report(
         "format": FORMAT,
         "object": found,
         "verdict": "object found" if found else no_object_reason(result),
+        "objects": _objects(result),
+        "objects_left_out": result.left_out,
         "method": context.parameters.carving.method,
         "dimensions": _dimensions(result.dimensions),
         "threshold": result.grid.threshold if result.grid is not None else None,
@@ -397,6 +421,20 @@ def summary(report: Mapping[str, Any]) -> str:
     if grid:
         threshold = "none" if grid["threshold"] is None else f"{grid['threshold']:.4f}"
         lines.append(f"{grid['method']} carving, voxels of {grid['voxel_size_m']:g} m, threshold {threshold}")
+    # Reports of before this entry have none.
+    for entry in report.get("objects", []):
+        if entry["files"][0] == "grid.npz":
+            continue  # the target: told above
+        d = entry["dimensions"]
+        x, y = d["position_m"]
+        lines.append(
+            f"object {entry['number']}: {d['length_m']:.3f} x {d['width_m']:.3f} x {d['height_m']:.3f} m,"
+            f" {d['volume_m3']:.4f} m³, heading {d['heading_deg']:.1f}°, at ({x + 0.0:.2f}, {y + 0.0:.2f}) m,"
+            f" {entry['views_used']} views"
+        )
+    for left in report.get("objects_left_out", []):
+        x, y = left["position_m"]
+        lines.append(f"no object at ({x + 0.0:.2f}, {y + 0.0:.2f}) m: {left['reason']}")
     lines.append(
         f"views: {views['in']} in, {views['used']} in the grid, {views['rejected']} not used,"
         f" {views['lost']} lost"

@@ -24,6 +24,7 @@ from csas_shadow_ros.parameter_file import pipeline_parameters, read_parameter_f
 from csas_shadow_ros.results import ResultsError, ResultsWriter, is_results_folder, read_report
 from csas_shadow_ros.results.report import _reasons
 from csas_shadow_ros.simulation import get_profile, simulate_bag
+from csas_shadow_ros.simulation.targets import box, join_bodies
 from msg_adapters.topics import STREAMS
 
 #: Views enough for a shape, few enough for a test.
@@ -195,6 +196,36 @@ def test_scores_against_the_truth_say_how_good_the_shape_is(results):
     assert scores["iou_truth"] > 0.6
     assert scores["iou_hull"] > 0.6
     assert scores["iou_hull_truth"] > 0.8
+
+
+def test_every_object_has_its_entry_its_line_its_grid_and_its_mesh(tmp_path):
+    bodies = box(0.35, 0.25, 0.2), box(0.3, 0.25, 0.15)
+    for body, x in zip(bodies, (-0.6, 0.6), strict=True):
+        body.apply_translation([x, 0.0, 0.0])
+    bag, out = tmp_path / "two", tmp_path / "out"
+    simulate_bag(bag, "tiny", join_bodies(bodies), seed=4)
+    said = run_quickly(bag, out)
+    report = said.json
+    assert [o["number"] for o in report["objects"]] == [1, 2]
+    assert report["objects"][0]["dimensions"] == report["dimensions"]
+    assert report["objects"][0]["files"] == ["grid.npz", "mesh.stl"]
+    second = report["objects"][1]
+    assert second["position_m"] == pytest.approx([0.6, 0.0], abs=0.08)
+    assert {"length_m", "height_m"} <= set(second["dimensions"]["intervals"])
+    assert second["views_used"] == 36
+    assert set(second["files"]) <= set(report["files"])
+    mesh = trimesh.load(out / "object_2.stl", force="mesh")
+    assert mesh.volume == pytest.approx(second["dimensions"]["volume_m3"], rel=1e-3)
+    with np.load(out / "object_2.npz") as grid:
+        assert np.count_nonzero(grid["occupied"]) == second["grid"]["occupied_voxels"]
+    lines = (out / "summary.txt").read_text().splitlines()
+    assert sum(line.startswith("object 2: ") for line in lines) == 1
+    alone = run_quickly(bag, tmp_path / "alone", "--max-objects", 1)
+    assert len(alone.json["objects"]) == 1
+    assert "no more than 1" in alone.json["objects_left_out"][0]["reason"]
+    assert not (tmp_path / "alone" / "object_2.stl").exists()
+    assert alone.json["dimensions"] == report["dimensions"]
+    assert run_quickly(bag, tmp_path / "none", "--max-objects", 0).code == 1
 
 
 def test_the_summary_has_found_and_true_dimensions_side_by_side(results):

@@ -1,0 +1,195 @@
+"""Several objects in one scene: each is found, carved in a volume of its own and measured; no phantom is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from csas_shadow_ros.core import pipeline
+from csas_shadow_ros.core.errors import ParameterError
+from csas_shadow_ros.core.objects import connected_pieces, further_targets, overlap_share
+from csas_shadow_ros.core.parameters import (
+    CarvingParameters,
+    PipelineParameters,
+    SubApertureParameters,
+    TargetParameters,
+)
+from csas_shadow_ros.core.target import Search, Target, stands_on_seabed
+from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.simulation import simulate
+from csas_shadow_ros.simulation.targets import box, cylinder, join_bodies
+
+#: Coarse, for speed: 60 views a circle, voxels of 2.5 cm.
+COARSE = PipelineParameters(
+    sub_aperture=SubApertureParameters(step_deg=6.0, check_sign=False),
+    carving=CarvingParameters(voxel_size_m=0.025),
+)
+BOX_M, CYLINDER_M = (0.8, 0.4, 0.4), (0.8, 0.3, 0.3)
+
+
+@pytest.fixture(scope="module")
+def two():
+    """A box and a piece of a cylinder, 2.2 m apart."""
+    bodies = box(*BOX_M), cylinder(CYLINDER_M[0], CYLINDER_M[1])
+    for body, x in zip(bodies, (-1.1, 1.1), strict=True):
+        body.apply_translation([x, 0.25 * x, 0.0])
+    # The scene is set so that its middle is the origin.
+    run = simulate("standard", join_bodies(bodies), seed=5)
+    middles = [part.bounds.mean(axis=0)[:2] for part in run.truth.target.split()]
+    return run, sorted((tuple(m) for m in middles), key=lambda m: m[0])
+
+
+@pytest.fixture(scope="module")
+def two_objects(two):
+    return pipeline.run(two[0].image, two[0].track, COARSE)
+
+
+@pytest.fixture(scope="module")
+def in_laying_grid():
+    run = simulate("standard", "frame_grid", seed=1)
+    return run, pipeline.run(run.image, run.track, COARSE)
+
+
+def block_grid(low, high, *, origin=(0.0, 0.0), voxel=0.1, shape=(8, 12, 12)):
+    """Return a grid in which the voxels [low, high) (z, y, x) are occupied."""
+    volume = Volume((origin[0], origin[1], voxel / 2), voxel, shape)
+    occupied = np.zeros(shape, bool)
+    occupied[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = True
+    return VoxelGrid(volume, np.zeros(shape, np.float32), np.ones(shape, np.uint16), 0.03, occupied)
+
+
+def test_two_separate_bodies_are_two_objects_each_where_and_as_large_as_it_is(two, two_objects):
+    _, middles = two
+    objects = sorted(two_objects.objects, key=lambda o: o.dimensions.position_m[0])
+    assert len(objects) == 2
+    assert two_objects.left_out == []
+    for one, middle, (length, width, height) in zip(objects, middles, (BOX_M, CYLINDER_M), strict=True):
+        d = one.dimensions
+        assert d.position_m == pytest.approx(middle, abs=0.04)
+        assert d.length_m == pytest.approx(length, abs=0.08)
+        assert d.width_m == pytest.approx(width, abs=0.08)
+        assert d.height_m == pytest.approx(height, abs=0.08)
+        assert abs(math.remainder(d.heading_rad, math.pi)) < math.radians(6.0)
+        assert {"length_m", "width_m", "height_m"} <= set(d.intervals)
+        assert one.mesh.is_watertight
+        assert one.views_used == 60
+
+
+def test_each_object_is_carved_in_a_volume_of_its_own_that_holds_it_alone(two, two_objects):
+    first, second = two_objects.objects
+    for one, other in ((first, second), (second, first)):
+        assert overlap_share(one.grid, other.grid) == 0.0
+        assert len(connected_pieces(one.grid.occupied)) == 1
+        x, y = other.dimensions.position_m
+        assert not (
+            abs(x - one.target.position_m[0]) < one.target.size_m[0] / 2
+            and abs(y - one.target.position_m[1]) < one.target.size_m[1] / 2
+        )
+
+
+@pytest.mark.parametrize("method", ["consensus", "soft"])
+def test_the_target_does_not_change_by_one_bit_however_many_bodies_are_carved(two, two_objects, method):
+    run, _ = two
+    p, several = COARSE, two_objects
+    if method == "soft":
+        p = replace(
+            COARSE,
+            carving=CarvingParameters(method=method, voxel_size_m=0.04),
+            sub_aperture=SubApertureParameters(step_deg=20.0, check_sign=False),
+        )
+        several = pipeline.run(run.image, run.track, p)
+    alone = pipeline.run(run.image, run.track, p, max_objects=1)
+    assert len(alone.objects) == 1
+    assert len(several.objects) == 2
+    assert several.objects[0].grid is several.grid
+    for a, b in ((alone.grid, several.grid), (alone.other_grid, several.other_grid)):
+        assert np.array_equal(a.likelihood, b.likelihood, equal_nan=True)
+        assert np.array_equal(a.occupied, b.occupied)
+        assert np.array_equal(a.views, b.views)
+        assert a.threshold == b.threshold
+    assert np.array_equal(alone.mesh.vertices, several.mesh.vertices)
+    assert alone.dimensions == several.dimensions
+    assert alone.views_used == several.views_used
+    assert "no more than 1" in alone.left_out[0].reason
+
+
+def test_a_target_that_is_given_is_the_only_object(two):
+    run, middles = two
+    given = TargetParameters(target="given", position_m=middles[1])
+    p = replace(COARSE, target=given, sub_aperture=SubApertureParameters(step_deg=20.0, check_sign=False))
+    result = pipeline.run(run.image, run.track, p)
+    assert len(result.objects) == 1
+    assert result.objects[0].dimensions.position_m == pytest.approx(middles[1], abs=0.1)
+
+
+def test_the_laying_grid_does_not_merge_with_the_target_in_it(in_laying_grid):
+    run, result = in_laying_grid
+    (low, high), volume = run.truth.target.bounds, result.grid.volume
+    _, j, i = np.nonzero(result.grid.occupied)
+    assert low[0] - 0.2 < volume.x_m[i].min() < low[0] + 0.1
+    assert high[0] - 0.1 < volume.x_m[i].max() < high[0] + 0.2
+    assert low[1] - 0.2 < volume.y_m[j].min() < low[1] + 0.1
+    assert high[1] - 0.1 < volume.y_m[j].max() < high[1] + 0.2
+    assert result.dimensions.length_m < 1.2 + 0.35
+
+
+def test_every_object_told_in_the_laying_grid_is_really_there(in_laying_grid):
+    run, result = in_laying_grid
+    assert any("phantom" in left.reason for left in result.left_out)
+    blocks = [part.bounds for part in run.truth.decor.split()]
+    for one in result.objects[1:]:
+        x, y = one.dimensions.position_m
+        assert any(
+            low[0] - 0.1 < x < high[0] + 0.1 and low[1] - 0.1 < y < high[1] + 0.1 for low, high in blocks
+        )
+        assert one.dimensions.height_m < 0.3
+
+
+def test_an_empty_seabed_holds_no_object(empty_run):
+    p = replace(COARSE, sub_aperture=SubApertureParameters(step_deg=30.0))
+    result = pipeline.run(empty_run.image, empty_run.track, p)
+    assert result.objects == []
+    assert result.left_out == []
+
+
+def test_a_single_body_is_a_single_object(box_run):
+    result = pipeline.run(box_run.image, box_run.track, COARSE)
+    assert len(result.objects) == 1
+    assert result.objects[0].mesh is result.mesh
+    assert result.left_out == []
+
+
+@pytest.mark.parametrize("count", [0, -1, 65])
+def test_a_number_of_objects_out_of_range_is_refused(box_run, count):
+    with pytest.raises(ParameterError, match=f"max_objects is {count}.* expected"):
+        pipeline.run(box_run.image, box_run.track, COARSE, max_objects=count)
+
+
+def test_what_hangs_higher_than_it_is_high_does_not_stand_on_the_seabed():
+    assert stands_on_seabed(0.0, 0.3)
+    assert stands_on_seabed(0.1, 0.3)
+    assert not stands_on_seabed(0.5, 0.8)
+
+
+def test_phantoms_take_no_place_of_a_body_and_bodies_beyond_the_most_are_named():
+    bodies = [Target((float(k), 0.0), (1.0, 1.0, 0.5), 9.0 - k, stands=k != 1) for k in range(5)]
+    search = Search(tuple(bodies), Volume((0.0, 0.0, 0.0), 1.0, (1, 1, 1)), np.zeros((1, 1, 1), np.float32))
+    targets, left_out = further_targets(search, 3)
+    assert targets == [bodies[2], bodies[3]]
+    assert [left.position_m[0] for left in left_out] == [1.0, 4.0]
+    assert "phantom" in left_out[0].reason
+    assert "no more than 3" in left_out[1].reason
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.03, -0.04])
+def test_the_share_of_two_objects_is_that_of_the_smaller_one_on_any_lattice(offset):
+    large = block_grid((0, 2, 2), (4, 10, 10))
+    half_in = block_grid((0, 4, 8), (4, 8, 12), origin=(offset, offset))
+    away = block_grid((0, 0, 0), (2, 2, 2), origin=(5.0, 5.0))
+    assert overlap_share(large, half_in) == pytest.approx(0.5)
+    assert overlap_share(half_in, large) == pytest.approx(0.5)
+    assert overlap_share(large, away) == 0.0
+    assert overlap_share(large, large) == 1.0
