@@ -54,8 +54,8 @@ _FLAT_SHARE, _FINE, _FINE_STEP_RAD = 0.08, 4, math.radians(0.5)
 _FINE_DIRECTIONS = 720
 #: After enhancement a straight side is seen so many cross-range cells outside of the mean over the aperture:
 #: the seabed is out of focus where the shadow is in focus, as light is behind a knife's edge. Measured on the
-#: simulated box and frame: 0.1 to 0.25; the least is taken, as round sides show less of it.
-_OUTSIDE_CELLS = 0.1
+#: simulated box and frame: 0.1 to 0.25.
+_OUTSIDE_CELLS = 0.15
 #: The carved voxels stand in for sides that no view shows; beside an edge that is seen they count so much.
 _VOXEL_WEIGHT = 0.1
 #: A side that stands out of the carved voxels by more than this (cross-range cells) belongs to something else
@@ -132,12 +132,13 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
     e_c = cross_range_axis(info.aspect_rad)
     directions, supports = [], []
     for sign, edge in ((1, last), (-1, first)):
-        out = _side(levels, rows, sign * (edge - u0) * scale, scale, sign, u0)
-        if out is None:
+        found = _side(levels, rows, sign * (edge - u0) * scale, scale, sign, u0)
+        if found is None:
             continue
+        out, straight = found
         axis = sign * e_c
         directions.append(math.atan2(axis[1], axis[0]))
-        supports.append(float(out * col_m - outside + axis @ np.asarray(target_m)))
+        supports.append(float(out * col_m - outside * straight + axis @ np.asarray(target_m)))
     tip = info.down_range_of_rows()[rows[-1]] + row_m / 2.0
     return SilhouetteSides(info, tuple(directions), tuple(supports), float(tip))
 
@@ -158,8 +159,11 @@ def _largest_piece(shadow: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
 
 def _side(
     levels: Levels, rows: NDArray[np.intp], out_px: FloatArray, scale: FloatArray, sign: int, u0: float
-) -> float | None:
-    """Return how far out a side reaches (pixels from column u0, at the target's range), or None."""
+) -> tuple[float, bool] | None:
+    """Return how far out a side reaches (pixels from column u0, at the target's range); if it is straight.
+
+    None where too little of it is seen.
+    """
     kept = np.abs(out_px - np.percentile(out_px, 90)) <= _SIDE_PX
     if kept.sum() < _MIN_ROWS:
         return None
@@ -179,7 +183,7 @@ def _side(
     shadow_power = 1.0 / levels.contrast**2
     dark = np.clip((1.0 - power) / (1.0 - shadow_power), -0.5, 1.2)
     edge = -_HALF_PX - 0.5 + float(dark.sum()) + float((offsets - steps).mean())
-    return (float(curve[0]) if straight else float(curve.max())) + edge
+    return (float(curve[0]) if straight else float(curve.max())) + edge, straight
 
 
 def _fitted_side(along: FloatArray, out_px: FloatArray) -> tuple[FloatArray, bool]:
