@@ -67,21 +67,27 @@ def test_every_process_killed_once_in_mid_run_and_the_grid_and_the_recording_are
     def kill_as_it_goes(done: int, total: int) -> None:
         # One every few views; the recorder and the player too.
         if len(victims) < len(order) and done >= 3 + 4 * len(victims) and done < total:
-            process = graphs[0].processes[order[len(victims)]]
+            process = graphs[-1].processes[order[len(victims)]]
             victims.append(process.node)
             pids.append(process.pid)
             os.kill(process.pid, signal.SIGKILL)
 
     deaths: list[str] = []
-    result = replay(
-        run_bag,
-        tmp_path,
-        PARAMETERS,
-        record=True,
-        composites=False,
-        progress=kill_as_it_goes,
-        notice=deaths.append,
-    )
+    for attempt in range(3):  # a busy machine may hear of the whole short run at once: then nobody was killed
+        folder = tmp_path / str(attempt)
+        for told in (victims, deaths, pids):
+            told.clear()
+        result = replay(
+            run_bag,
+            folder,
+            PARAMETERS,
+            record=True,
+            composites=False,
+            progress=kill_as_it_goes,
+            notice=deaths.append,
+        )
+        if len(victims) >= 3:
+            break
     assert len(victims) >= 3, f"the run was over before more could be killed: {victims}"
     assert len(deaths) == len(victims)
     assert all(f"{name} was killed by signal 9" in line for name, line in zip(victims, deaths, strict=True))
@@ -90,10 +96,10 @@ def test_every_process_killed_once_in_mid_run_and_the_grid_and_the_recording_are
     assert {name: result.nodes[name].restarts for name in victims if name in result.nodes} == {
         name: 1 for name in victims if name in result.nodes
     }
-    run = read_run(tmp_path / "recording")
+    run = read_run(folder / "recording")
     for stream in ("sub_aperture", "shadow", "likelihood", "shadow_mask"):
         assert run.counts[stream] == result.views_total, stream
-    pids += [p.pid for p in graphs[0].processes.values()]
+    pids += [p.pid for p in graphs[-1].processes.values()]
     assert not [pid for pid in pids if alive(pid)], "no process is left"
 
 
