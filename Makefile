@@ -65,7 +65,8 @@ types: install ## mypy
 
 unit: install ## pytest alone
 	@mkdir -p $(ROS_LOG_DIR)
-	$(PY) -m pytest -n $(PYTEST_WORKERS)
+	$(PY) -m pytest -n $(PYTEST_WORKERS) --ignore=test/nodes
+	$(PY) -m pytest test/nodes  # whole graphs of processes: alone on the machine
 
 accuracy-short: install ## a few cases of it against their floors, in a minute
 	$(PY) benchmarks/accuracy.py --short

@@ -158,6 +158,9 @@ class BagRecorderNode(CsasNode):
             inlet, is_info = flow
             if report:
                 self.counts["in"] += not is_info
+                if stamp in inlet.stamps[not is_info]:
+                    # On disk before it is said to be: nobody sends again what a killed recorder reported.
+                    self.writer.flush()
                 inlet.wrote(stamp, is_info=is_info)
             else:
                 inlet.stamps[is_info].add(stamp)
