@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 
 from csas_shadow_ros.core import reference, segmentation
 from csas_shadow_ros.core.carving import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, Carver
+from csas_shadow_ros.core.echo import layover_per_metre
 from csas_shadow_ros.core.geometry import ShadowCamera, View, ViewInfo
-from csas_shadow_ros.core.hollows import EchoLook, _layover, _looks, _surface
+from csas_shadow_ros.core.hollows import EchoLook, _looks, _surface
 from csas_shadow_ros.core.likelihood import Levels, box_mean
 from csas_shadow_ros.core.parameters import (
     CarvingParameters,
@@ -299,7 +300,7 @@ def _brightness(grid: VoxelGrid, views: list[tuple[ViewInfo, Levels]]) -> NDArra
     total, count = np.zeros(len(at)), np.zeros(len(at))
     for info, levels in views:
         power = np.minimum(box_mean(levels.power, levels.known, (1, 1)), 4.0)
-        shift = _layover(info)
+        shift = layover_per_metre(info)
         place = np.stack([x + z * shift[0], y + z * shift[1], np.ones_like(x)])
         u, v, _ = np.floor(info.camera.ground_to_pixel @ place + 0.5).astype(int)
         inside = (u >= 0) & (v >= 0) & (u < power.shape[1]) & (v < power.shape[0])

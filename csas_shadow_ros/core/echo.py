@@ -15,7 +15,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from .geometry import ViewInfo
+from .geometry import ViewInfo, unit_to_sonar
 from .volume import Volume
 
 BoolArray = NDArray[np.bool_]
@@ -24,6 +24,11 @@ BoolArray = NDArray[np.bool_]
 #: strong echoes have sidelobes, and sound that bounced twice arrives late. With fewer, the measured vehicle
 #: of docs/examples.md is hollowed out from below; more costs simulated undercuts.
 _RESPONSE_CELLS = (7.0, 5.0)
+
+
+def layover_per_metre(info: ViewInfo) -> NDArray[np.float64]:
+    """Return tan ψ û(θ): how far, for each metre of height, an echo lies towards the sonar."""
+    return np.asarray(math.tan(info.camera.grazing_rad) * unit_to_sonar(info.aspect_rad), dtype=np.float64)
 
 
 def opaque_part(occupied: BoolArray, grazing_rad: float, slack_voxels: float = 1.0) -> BoolArray:
@@ -215,15 +220,13 @@ def echo_zone(info: ViewInfo, volume: Volume, occupied: BoolArray, opaque: BoolA
         ],
         np.int64,
     )
-    tan_grazing = math.tan(camera.grazing_rad)
-    layover = tan_grazing * np.array([math.cos(info.aspect_rad), math.sin(info.aspect_rad)])
     _mark_echoes(
         occupied,
         opaque,
         np.asarray(volume.origin_m, dtype=np.float64),
         volume.voxel_size_m,
         np.asarray(camera.sonar_m, dtype=np.float64),
-        layover,
+        layover_per_metre(info),
         np.ascontiguousarray(camera.ground_to_pixel[:2]),
         reach,
         out,

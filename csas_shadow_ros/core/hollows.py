@@ -26,7 +26,7 @@ import scipy.ndimage
 import trimesh
 from numpy.typing import NDArray
 
-from .echo import count_looks
+from .echo import count_looks, layover_per_metre
 from .geometry import ViewInfo
 from .likelihood import Levels, box_mean
 from .mesh import mesh_from_grid
@@ -106,18 +106,12 @@ class EchoLook:
         return dark, known
 
 
-def _layover(info: ViewInfo) -> NDArray[np.float64]:
-    """Return tan ψ û(θ): how far, for each metre of height, an echo lies towards the sonar."""
-    direction = np.array([math.cos(info.aspect_rad), math.sin(info.aspect_rad)])
-    return math.tan(info.camera.grazing_rad) * direction
-
-
 def _pixels_of(info: ViewInfo, volume: Volume) -> tuple[slice, slice]:
     """Return the rows and columns of a view that a volume's echoes can lie in."""
     x, y, _ = volume.centre_m
     length, width, height = volume.size_m
     corners = np.array([[x + a * length, y + b * width] for a in (-0.5, 0.5) for b in (-0.5, 0.5)])
-    corners = np.concatenate([corners, corners + height * _layover(info)])
+    corners = np.concatenate([corners, corners + height * layover_per_metre(info)])
     camera = info.camera
     pixels = corners @ camera.ground_to_pixel[:2, :2].T + camera.ground_to_pixel[:2, 2]
     slices = []
@@ -163,7 +157,7 @@ def _looks(
             np.asarray(volume.origin_m, dtype=np.float64),
             volume.voxel_size_m,
             np.asarray(camera.sonar_m, dtype=np.float64),
-            _layover(look.info),
+            layover_per_metre(look.info),
             affine,
             dark,
             known,
