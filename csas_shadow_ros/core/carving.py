@@ -39,6 +39,11 @@ _SCALE = 4096
 MASK_OUTSIDE, MASK_COVERED, MASK_UNKNOWN, MASK_SHADOW = 0, 64, 128, 255
 #: The second look is taken so many voxels round what the first one left.
 _SECOND_LOOK_VOXELS = 2
+#: Voxels a side of the square blocks of a slice that are counted as one where a mask allows it.
+_BLOCK = 16
+#: What an unknown pixel adds to the sums over a mask; blocks whose pixels are more than that are not looked up.
+_UNKNOWN = 1 << 16
+_NOWHERE = np.empty((0, 0), np.bool_)
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
@@ -77,6 +82,125 @@ def _carve_slices(
                     count[k, j, i] += np.uint16(1)
 
 
+@numba.njit(cache=True, nogil=True)
+def _cells_of_mask(
+    mask: NDArray[np.uint8],
+    echo: NDArray[np.bool_],
+    first: tuple[int, int],
+    cells: NDArray[np.uint8],
+    sums: NDArray[np.uint32],
+) -> None:  # pragma: no cover
+    """Code the cells between four pixels of a part of a mask, and sum its pixels up.
+
+    `first` is the part's first (row, col). A cell has a bit for each of its pixels that is outside the
+    silhouette, and the fifth for any that is unknown; covered pixels are unknown in `echo` (everywhere if that is
+    empty), outside elsewhere. `sums[v, u]` is the sum of the pixels above v and left of u: 1 outside, 2¹⁶ unknown,
+    modulo 2³².
+    """
+    rows, cols = cells.shape
+    v0, u0 = first
+    anywhere = echo.size == 0
+    for v in range(rows):
+        line = np.uint32(0)
+        for u in range(cols):
+            value = mask[v0 + v, u0 + u]
+            if value == MASK_COVERED:
+                value = MASK_UNKNOWN if anywhere or echo[v0 + v, u0 + u] else MASK_OUTSIDE
+            code = np.uint8(0)
+            if value == MASK_UNKNOWN:
+                code = np.uint8(16)
+                line += np.uint32(_UNKNOWN)
+            elif value == MASK_OUTSIDE:
+                code = np.uint8(1)
+                line += np.uint32(1)
+            sums[v + 1, u + 1] = sums[v, u + 1] + line
+            cells[v, u] = code
+    for v in range(rows - 1):
+        for u in range(cols - 1):
+            right, low, both = cells[v, u + 1], cells[v + 1, u], cells[v + 1, u + 1]
+            code = cells[v, u] | ((right & 1) << 1) | ((low & 1) << 2) | ((both & 1) << 3)
+            cells[v, u] = code | ((right | low | both) & 16)
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
+def _carve_masks(
+    cells: NDArray[np.uint8],
+    sums: NDArray[np.uint32],
+    affines: NDArray[np.float64],
+    x0: float,
+    y0: float,
+    step: float,
+    first: int,
+    last: int,
+    total: NDArray[np.int32],
+    count: NDArray[np.uint16],
+    block_total: NDArray[np.int32],
+    block_count: NDArray[np.uint16],
+) -> None:  # pragma: no cover
+    """Add a mask at every voxel's shadow pixel (bilinear) to the slices [first, last).
+
+    A block of voxels whose shadow falls on pixels that are all alike is counted as one.
+    """
+    rows, cols = cells.shape
+    ny, nx = total.shape[1:]
+    one = np.int32(_SCALE)
+    for k in range(first, last):
+        a = affines[k]
+        du, dv = a[0, 0] * step, a[1, 0] * step
+        eu, ev = a[0, 1] * step, a[1, 1] * step
+        for bj in range(block_total.shape[1]):
+            j0 = bj * _BLOCK
+            j1 = min(j0 + _BLOCK, ny)
+            y = y0 + j0 * step
+            for bi in range(block_total.shape[2]):
+                i0 = bi * _BLOCK
+                i1 = min(i0 + _BLOCK, nx)
+                # The block's pixels, and one more all round: rounding, and the neighbours that are interpolated.
+                u = a[0, 0] * x0 + a[0, 1] * y + a[0, 2] + i0 * du
+                v = a[1, 0] * x0 + a[1, 1] * y + a[1, 2] + i0 * dv
+                ru, rv = (i1 - 1 - i0) * du, (i1 - 1 - i0) * dv
+                su, sv = (j1 - 1 - j0) * eu, (j1 - 1 - j0) * ev
+                left = math.floor(u + min(ru, 0.0) + min(su, 0.0)) - 1
+                right = math.floor(u + max(ru, 0.0) + max(su, 0.0)) + 3
+                top = math.floor(v + min(rv, 0.0) + min(sv, 0.0)) - 1
+                bottom = math.floor(v + max(rv, 0.0) + max(sv, 0.0)) + 3
+                if right <= 0 or bottom <= 0 or left >= cols or top >= rows:
+                    continue
+                area = (right - left) * (bottom - top)
+                if left >= 0 and top >= 0 and right <= cols and bottom <= rows and area < _UNKNOWN:
+                    inside = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+                    inside = np.uint32(inside)
+                    if inside == np.uint32(area) * np.uint32(_UNKNOWN):
+                        continue
+                    if inside == np.uint32(0) or inside == np.uint32(area):
+                        block_count[k, bj, bi] += np.uint16(1)
+                        if inside:
+                            block_total[k, bj, bi] += one
+                        continue
+                for j in range(j0, j1):
+                    line_y = y0 + j * step
+                    u = a[0, 0] * x0 + a[0, 1] * line_y + a[0, 2]
+                    v = a[1, 0] * x0 + a[1, 1] * line_y + a[1, 2]
+                    for i in range(i0, i1):
+                        uu, vv = u + i * du, v + i * dv
+                        if uu < 0.0 or vv < 0.0 or uu > cols - 1 or vv > rows - 1:
+                            continue
+                        iu, iv = min(int(uu), cols - 2), min(int(vv), rows - 2)
+                        cell = np.int32(cells[iv, iu])
+                        if cell >= 16:
+                            continue
+                        count[k, j, i] += np.uint16(1)
+                        if cell == 15:
+                            total[k, j, i] += one
+                        elif cell:
+                            fu, fv = np.float32(uu - iu), np.float32(vv - iv)
+                            p00, p01 = np.float32(cell & 1), np.float32((cell >> 1) & 1)
+                            p10, p11 = np.float32((cell >> 2) & 1), np.float32(cell >> 3)
+                            upper = p00 + fu * (p01 - p00)
+                            value = upper + fv * (p10 + fu * (p11 - p10) - upper)
+                            total[k, j, i] += np.int32(value * np.float32(_SCALE) + np.float32(0.5))
+
+
 def _threads(pool: ThreadPoolExecutor | None, work: Any, slices: int) -> None:
     if pool is None or slices < 2:
         work(0, slices)
@@ -103,13 +227,104 @@ class KeptMask:
         return View(self.info, pixels.reshape(self.info.camera.shape))
 
 
-def _outside_of_mask(pixels: NDArray[np.uint8], echo: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-    """Return 1 outside the silhouette, 0 inside, NaN unknown; covered pixels count outside but in `echo`."""
-    outside = np.where(pixels == MASK_SHADOW, np.float32(0.0), np.float32(1.0))
-    outside[pixels == MASK_UNKNOWN] = np.nan
-    covered = pixels == MASK_COVERED
-    outside[covered if echo is None else covered & echo] = np.nan
-    return outside
+class _Sums:
+    """What has been added to each voxel of a volume: how many views, and their whole numbers.
+
+    Blocks of voxels to which a mask adds the same are counted apart: most of a view takes no more than that.
+    """
+
+    def __init__(self, volume: Volume, pool: ThreadPoolExecutor | None) -> None:
+        self._volume = volume
+        self._pool = pool
+        nz, ny, nx = volume.shape
+        blocks = (nz, -(-ny // _BLOCK), -(-nx // _BLOCK))
+        self._total, self._count = np.zeros(volume.shape, np.int32), np.zeros(volume.shape, np.uint16)
+        self._block_total, self._block_count = np.zeros(blocks, np.int32), np.zeros(blocks, np.uint16)
+
+    def add_image(self, image: NDArray[np.float32], info: ViewInfo) -> None:
+        """Add an image, NaN where unknown, at every voxel's shadow pixel."""
+        v = self._volume
+        affines = _slice_affines(info, v)
+
+        def work(first: int, last: int) -> None:
+            _carve_slices(
+                image,
+                affines,
+                v.origin_m[0],
+                v.origin_m[1],
+                v.voxel_size_m,
+                first,
+                last,
+                self._total,
+                self._count,
+            )
+
+        _threads(self._pool, work, v.shape[0])
+
+    def add_mask(
+        self, pixels: NDArray[np.uint8], info: ViewInfo, echo: NDArray[np.bool_] = _NOWHERE
+    ) -> None:
+        """Add a mask: 1 outside the silhouette, 0 inside; covered pixels are outside except in `echo`."""
+        v = self._volume
+        affines = _slice_affines(info, v)
+        first, shape = _part_of_image(affines, v, pixels.shape)
+        if min(shape) < 2:
+            return
+        # The affines count from the part's own corner.
+        affines[:, :, 2] -= first[::-1]
+        cells = np.empty(shape, np.uint8)
+        sums = np.zeros((shape[0] + 1, shape[1] + 1), np.uint32)
+        _cells_of_mask(pixels, echo, first, cells, sums)
+
+        def work(first: int, last: int) -> None:
+            _carve_masks(
+                cells,
+                sums,
+                affines,
+                v.origin_m[0],
+                v.origin_m[1],
+                v.voxel_size_m,
+                first,
+                last,
+                self._total,
+                self._count,
+                self._block_total,
+                self._block_count,
+            )
+
+        _threads(self._pool, work, v.shape[0])
+
+    @property
+    def total(self) -> NDArray[np.int32]:
+        """Sum of all images, in 1/4096, shape (nz, ny, nx)."""
+        return self._total + self._spread(self._block_total)
+
+    @property
+    def count(self) -> NDArray[np.uint16]:
+        """Number of images that know something of each voxel, shape (nz, ny, nx)."""
+        return self._count + self._spread(self._block_count)
+
+    def _spread(self, blocks: NDArray[Any]) -> NDArray[Any]:
+        _, ny, nx = self._volume.shape
+        return blocks.repeat(_BLOCK, axis=1)[:, :ny].repeat(_BLOCK, axis=2)[:, :, :nx]
+
+
+def _slice_affines(info: ViewInfo, volume: Volume) -> NDArray[np.float64]:
+    """Return, for each height slice, the matrix from ground metres to pixels, shape (nz, 2, 3)."""
+    return np.stack([info.camera.height_slice_affine(float(z)) for z in volume.z_m])
+
+
+def _part_of_image(
+    affines: NDArray[np.float64], volume: Volume, shape: tuple[int, ...]
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return first (row, col) and shape of the part of an image that a volume's shadows can fall on."""
+    corners = np.array([[x, y, 1.0] for x in volume.x_m[[0, -1]] for y in volume.y_m[[0, -1]]])
+    # Lines of points are cast to lines: the lowest and the highest slice bound all.
+    pixels = np.concatenate([corners @ affines[0].T, corners @ affines[-1].T])[:, ::-1]
+    low = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 2, 0)
+    high = np.minimum(np.floor(pixels.max(axis=0)).astype(int) + 4, shape)
+    size = np.maximum(high - low, 0)
+    return (int(low[0]), int(low[1])), (int(size[0]), int(size[1]))
 
 
 class Carver:
@@ -140,8 +355,7 @@ class Carver:
         self.volume = volume
         self.parameters = parameters or CarvingParameters()
         self._pool = pool
-        self._total = np.zeros(volume.shape, np.int32)
-        self._count = np.zeros(volume.shape, np.uint16)
+        self._sums = _Sums(volume, pool)
         self._masks: dict[int, KeptMask] = {}
         #: Stamps of the views that have been integrated.
         self.stamps: set[int] = set()
@@ -169,20 +383,23 @@ class Carver:
             return False
         if len(self.stamps) >= np.iinfo(np.uint16).max:
             raise ViewError(f"the grid holds {len(self.stamps)} views; expected no more than that")
-        image = self._image(view)
+        self._check(view)
         top = self.volume.z_m[-1]
         if top >= view.info.camera.sonar_m[2]:
             raise ViewError(
                 f"the volume reaches {top:g} m, the sonar is at {view.info.camera.sonar_m[2]:g} m;"
                 " expected it above"
             )
-        _add(image, view.info, self.volume, self._total, self._count, self._pool)
+        if self.parameters.takes_masks:
+            self._sums.add_mask(np.ascontiguousarray(view.pixels), view.info)
+        else:
+            self._sums.add_image(np.ascontiguousarray(view.pixels), view.info)
         self.stamps.add(view.info.stamp_ns)
         if self.parameters.method == "consensus":
             self._masks[view.info.stamp_ns] = KeptMask.of(view)
         return True
 
-    def _image(self, view: View) -> NDArray[np.float32]:
+    def _check(self, view: View) -> None:
         pixels = view.pixels
         method = self.parameters.method
         if not self.parameters.takes_masks:
@@ -191,17 +408,17 @@ class Carver:
             low, high = float(np.nanmin(pixels, initial=1.0)), float(np.nanmax(pixels, initial=0.0))
             if low < 0.0 or high > 1.0:
                 raise ViewError(f"l_out of the view spans [{low:g}, {high:g}]; expected [0, 1] or NaN")
-            return np.ascontiguousarray(pixels)
+            return
         if pixels.dtype != np.uint8:
             raise ViewError(f"{method} carving got {pixels.dtype} pixels; expected a uint8 mask")
-        odd = ~np.isin(pixels, (MASK_SHADOW, MASK_OUTSIDE, MASK_UNKNOWN, MASK_COVERED))
-        if odd.any():
-            raise ViewError(f"shadow mask holds the value {pixels[odd][0]}; expected 0, 64, 128 or 255")
-        return _outside_of_mask(pixels)
+        found = np.flatnonzero(np.bincount(pixels.ravel(), minlength=256))
+        odd = set(found.tolist()) - {MASK_SHADOW, MASK_OUTSIDE, MASK_UNKNOWN, MASK_COVERED}
+        if odd:
+            raise ViewError(f"shadow mask holds the value {min(odd)}; expected 0, 64, 128 or 255")
 
     def likelihood(self) -> NDArray[np.float32]:
         """Return the mean of l_out (masks: the fraction of views that contradict the voxel); NaN unknown."""
-        return _mean(self._total, self._count, self.parameters, len(self.stamps))
+        return _mean(self._sums.total, self._sums.count, self.parameters, len(self.stamps))
 
     def grid(self) -> VoxelGrid:
         """Threshold what has been carved so far.
@@ -218,47 +435,29 @@ class Carver:
 
     def first_look(self) -> VoxelGrid:
         """Threshold what has been carved so far, covered pixels unknown: what `grid` starts from."""
-        return thresholded(self.volume, self.likelihood(), self._count.copy(), self.parameters)
+        return thresholded(self.volume, self.likelihood(), self._sums.count, self.parameters)
 
     def _second_look(self, first: VoxelGrid) -> VoxelGrid:
         """Carve again what the first look left, with the pixels that its own echo cannot cover as seabed."""
         box, part = part_around(first.occupied, self.volume, _SECOND_LOOK_VOXELS)
         body = first.occupied[box]
-        total, count = np.zeros(part.shape, np.int32), np.zeros(part.shape, np.uint16)
+        sums = _Sums(part, self._pool)
         opaque: dict[int, NDArray[np.bool_]] = {}
         for stamp in sorted(self._masks):
             kept = self._masks[stamp]
             pixels = kept.view().pixels
-            zone = None
+            zone = _NOWHERE
             if (pixels == MASK_COVERED).any():
                 # The grazing angle hardly changes round the circle: one body a quarter of a degree.
                 quarters = round(math.degrees(kept.info.camera.grazing_rad) * 4.0)
                 if quarters not in opaque:
                     opaque[quarters] = opaque_part(body, math.radians(quarters / 4.0))
                 zone = echo_zone(kept.info, part, body, opaque[quarters])
-            _add(_outside_of_mask(pixels, zone), kept.info, part, total, count, self._pool)
+            sums.add_mask(pixels, kept.info, zone)
         likelihood, views = first.likelihood.copy(), first.views.copy()
-        likelihood[box] = _mean(total, count, self.parameters, len(self.stamps))
-        views[box] = count
+        likelihood[box] = _mean(sums.total, sums.count, self.parameters, len(self.stamps))
+        views[box] = sums.count
         return thresholded(self.volume, likelihood, views, self.parameters)
-
-
-def _add(
-    image: NDArray[np.float32],
-    info: ViewInfo,
-    volume: Volume,
-    total: NDArray[np.int32],
-    count: NDArray[np.uint16],
-    pool: ThreadPoolExecutor | None,
-) -> None:
-    """Add an image to every voxel of a volume, at its shadow's pixel."""
-    affines = np.stack([info.camera.height_slice_affine(float(z)) for z in volume.z_m])
-    x0, y0, _ = volume.origin_m
-
-    def work(first: int, last: int) -> None:
-        _carve_slices(image, affines, x0, y0, volume.voxel_size_m, first, last, total, count)
-
-    _threads(pool, work, volume.shape[0])
 
 
 def _mean(
