@@ -16,11 +16,11 @@ echo can cover; the others are seabed, and carve what the first look left standi
 from __future__ import annotations
 
 import math
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
+import lz4.block
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +80,23 @@ def _carve_slices(
                 if value == value:  # NaN where any neighbour is unknown
                     total[k, j, i] += np.int32(value * np.float32(4096.0) + np.float32(0.5))
                     count[k, j, i] += np.uint16(1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _first_odd(mask: NDArray[np.uint8]) -> int:  # pragma: no cover
+    """Return the first value that no mask may hold, -1 if there is none."""
+    rows, cols = mask.shape
+    for v in range(rows):
+        odd = False
+        for u in range(cols):
+            m = mask[v, u]
+            odd |= (m != MASK_OUTSIDE) & (m != MASK_COVERED) & (m != MASK_UNKNOWN) & (m != MASK_SHADOW)
+        if odd:
+            for u in range(cols):
+                m = mask[v, u]
+                if m not in (MASK_OUTSIDE, MASK_COVERED, MASK_UNKNOWN, MASK_SHADOW):
+                    return int(m)
+    return -1
 
 
 @numba.njit(cache=True, nogil=True)
@@ -219,11 +236,11 @@ class KeptMask:
     @classmethod
     def of(cls, view: View) -> KeptMask:
         """Keep a mask."""
-        return cls(view.info, zlib.compress(np.ascontiguousarray(view.pixels).tobytes(), 1))
+        return cls(view.info, lz4.block.compress(np.ascontiguousarray(view.pixels)))
 
     def view(self) -> View:
         """Return the mask as it was."""
-        pixels = np.frombuffer(zlib.decompress(self.packed), np.uint8)
+        pixels = np.frombuffer(lz4.block.decompress(self.packed), np.uint8)
         return View(self.info, pixels.reshape(self.info.camera.shape))
 
 
@@ -311,7 +328,7 @@ class _Sums:
 
 def _slice_affines(info: ViewInfo, volume: Volume) -> NDArray[np.float64]:
     """Return, for each height slice, the matrix from ground metres to pixels, shape (nz, 2, 3)."""
-    return np.stack([info.camera.height_slice_affine(float(z)) for z in volume.z_m])
+    return info.camera.height_slice_affines(volume.z_m)
 
 
 def _part_of_image(
@@ -411,10 +428,9 @@ class Carver:
             return
         if pixels.dtype != np.uint8:
             raise ViewError(f"{method} carving got {pixels.dtype} pixels; expected a uint8 mask")
-        found = np.flatnonzero(np.bincount(pixels.ravel(), minlength=256))
-        odd = set(found.tolist()) - {MASK_SHADOW, MASK_OUTSIDE, MASK_UNKNOWN, MASK_COVERED}
-        if odd:
-            raise ViewError(f"shadow mask holds the value {min(odd)}; expected 0, 64, 128 or 255")
+        odd = _first_odd(pixels)
+        if odd >= 0:
+            raise ViewError(f"shadow mask holds the value {odd}; expected 0, 64, 128 or 255")
 
     def likelihood(self) -> NDArray[np.float32]:
         """Return the mean of l_out (masks: the fraction of views that contradict the voxel); NaN unknown."""

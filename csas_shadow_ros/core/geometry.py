@@ -387,12 +387,26 @@ class ShadowCamera:
         GeometryError
             If z is not below the sonar.
         """
-        if not z_m < self._sonar[2]:
-            raise GeometryError(f"height {z_m:g} m is not below the sonar at {self._sonar[2]:g} m")
+        return np.asarray(self.height_slice_affines(np.array([z_m]))[0])
+
+    def height_slice_affines(self, z_m: FloatArray) -> FloatArray:
+        """Return `height_slice_affine` of several heights, shape (n, 2, 3).
+
+        Raises
+        ------
+        GeometryError
+            If a height is not below the sonar.
+        """
+        top = float(np.max(z_m))
+        if not top < self._sonar[2]:
+            raise GeometryError(f"height {top:g} m is not below the sonar at {self._sonar[2]:g} m")
         p = self.projection
-        w = p[2, 2] * z_m + p[2, 3]  # rows 2 of P has no x, y terms: A is affine (checked at construction)
-        affine: FloatArray = np.column_stack([p[:2, 0], p[:2, 1], p[:2, 2] * z_m + p[:2, 3]]) / w
-        return affine
+        affines = np.empty((len(z_m), 2, 3))
+        affines[:, :, :2] = p[:2, :2]
+        affines[:, :, 2] = p[:2, 2] * z_m[:, None] + p[:2, 3]
+        # Row 2 of P has no x, y terms: A is affine (checked at construction).
+        affines /= (p[2, 2] * z_m + p[2, 3])[:, None, None]
+        return affines
 
 
 @dataclass(frozen=True)

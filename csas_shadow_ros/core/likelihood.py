@@ -6,7 +6,7 @@ Amplitudes are taken as Rayleigh distributed, with mode Ïƒ_r on the seabed and Ï
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -54,6 +54,13 @@ class Levels:
     estimated: bool
     power: FloatImage
     known: NDArray[np.bool_]
+    _echoes: dict[float, NDArray[np.bool_]] = field(default_factory=dict, repr=False)
+
+    def echoes(self, echo_db: float) -> NDArray[np.bool_]:
+        """Return `echo_mask` of the view, worked out once: likelihood and segmentation both ask for it."""
+        if echo_db not in self._echoes:
+            self._echoes[echo_db] = echo_mask(self.power, self.known, echo_db)
+        return self._echoes[echo_db]
 
 
 def l_out(power: FloatImage, contrast: float) -> FloatImage:
@@ -185,7 +192,8 @@ def box_mean(power: FloatImage, known: NDArray[np.bool_], radius_px: tuple[int, 
     size = (2 * radius_px[1] + 1, 2 * radius_px[0] + 1)
     total = cv2.boxFilter(power, -1, size, normalize=False)
     weight = cv2.boxFilter(known.view(np.uint8), cv2.CV_32F, size, normalize=False)
-    return np.asarray(total / np.maximum(weight, np.float32(1.0)), dtype=np.float32)
+    np.maximum(weight, np.float32(1.0), out=weight)
+    return np.asarray(np.divide(total, weight, out=total), dtype=np.float32)
 
 
 def fit_contrast(power: FloatImage, known: NDArray[np.bool_], start_db: float) -> tuple[float, float] | None:
@@ -310,5 +318,5 @@ def outside_likelihood(
     out = l_out(power, levels.contrast)
     out[~levels.known] = np.nan
     if p.echo_unknown:
-        out[echo_mask(levels.power, levels.known, p.echo_db)] = np.nan
+        out[levels.echoes(p.echo_db)] = np.nan
     return replace(view, pixels=out)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .carving import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from .errors import ViewError
 from .geometry import View, ViewInfo
-from .likelihood import Levels, box_mean, echo_mask, view_levels
+from .likelihood import Levels, box_mean, view_levels
 from .parameters import LikelihoodParameters
 
 #: Shadow where the local mean power is less than this far from the shadow's level to the seabed's. At a
@@ -101,10 +101,10 @@ def segment_shadow(
     """
     p = parameters or LikelihoodParameters()
     levels = levels or view_levels(view, p)
-    shadow = _of_target(dark_pixels(levels, view.info).view(np.uint8), view, target_m, reach_m)
+    shadow = _of_target(dark_pixels(levels, view.info), view, target_m, reach_m)
     mask = np.full(levels.known.shape, MASK_OUTSIDE, np.uint8)
     if p.echo_unknown:
-        echo = echo_mask(levels.power, levels.known, p.echo_db)
+        echo = levels.echoes(p.echo_db)
         mask[_before_shadow(shadow, echo)] = MASK_COVERED
         mask[echo] = MASK_UNKNOWN
     mask[shadow] = MASK_SHADOW
@@ -113,25 +113,54 @@ def segment_shadow(
 
 
 def _of_target(
-    dark: NDArray[np.uint8], view: View, target_m: tuple[float, float], reach_m: float
+    dark: NDArray[np.bool_], view: View, target_m: tuple[float, float], reach_m: float
 ) -> NDArray[np.bool_]:
     """Keep the dark patches that begin at the target."""
     camera = view.info.camera
     u, v, _ = camera.ground_to_pixel @ np.array([target_m[0], target_m[1], 1.0])
     rows_m, cols_m = camera.spacing_m
     reach = reach_m or 0.1 * camera.cols * cols_m
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(dark, connectivity=8)
     # A patch belongs to the target if any of it lies in the box that the target's near shadow must cross.
     top, bottom = v - reach / rows_m, v + (reach + reach / math.tan(camera.grazing_rad) / 4.0) / rows_m
     left, right = u - reach / cols_m, u + reach / cols_m
-    rows = slice(max(0, int(top)), max(0, int(bottom) + 1))
-    cols = slice(max(0, int(left)), max(0, int(right) + 1))
-    hit = np.unique(labels[rows, cols])
-    keep = np.zeros(count, bool)
-    keep[hit] = True
-    keep[0] = False
-    keep &= stats[:, cv2.CC_STAT_AREA] >= _MIN_SHADOW_PIXELS
-    return np.asarray(keep[labels], dtype=np.bool_)
+    out = np.zeros(dark.shape, np.bool_)
+    _patches_in_box(
+        dark,
+        (max(0, int(top)), min(camera.rows, max(0, int(bottom) + 1))),
+        (max(0, int(left)), min(camera.cols, max(0, int(right) + 1))),
+        _MIN_SHADOW_PIXELS,
+        out,
+    )
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _patches_in_box(
+    dark: NDArray[np.bool_], rows: tuple[int, int], cols: tuple[int, int], least: int, out: NDArray[np.bool_]
+) -> None:  # pragma: no cover
+    """Mark the dark patches (8-connected) of `least` pixels or more that reach into a box."""
+    n_rows, n_cols = dark.shape
+    seen = np.zeros(dark.shape, np.bool_)
+    patch = np.empty((dark.size, 2), np.int32)
+    for i in range(rows[0], rows[1]):
+        for j in range(cols[0], cols[1]):
+            if not dark[i, j] or seen[i, j]:
+                continue
+            seen[i, j] = True
+            patch[0, 0], patch[0, 1] = i, j
+            size, done = 1, 0
+            while done < size:
+                a, b = patch[done, 0], patch[done, 1]
+                done += 1
+                for c in range(max(0, a - 1), min(n_rows, a + 2)):
+                    for d in range(max(0, b - 1), min(n_cols, b + 2)):
+                        if dark[c, d] and not seen[c, d]:
+                            seen[c, d] = True
+                            patch[size, 0], patch[size, 1] = c, d
+                            size += 1
+            if size >= least:
+                for k in range(size):
+                    out[patch[k, 0], patch[k, 1]] = True
 
 
 @numba.njit(cache=True, nogil=True)

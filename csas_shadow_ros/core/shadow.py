@@ -7,8 +7,9 @@ every row of the view to the target's own range r₀ lays these shadows over one
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import ducc0
 import numba
 import numpy as np
 import scipy.fft
@@ -17,6 +18,9 @@ from numpy.typing import NDArray
 from .errors import ViewError
 from .geometry import View, ViewInfo, cross_range_axis, down_range_axis
 from .parameters import ShadowParameters
+
+#: Rows after which a running product of phases starts anew: its rounding stays under 1e-5.
+_RUN = 32
 
 
 def focus_range(info: ViewInfo, target_m: tuple[float, float]) -> float:
@@ -48,15 +52,57 @@ def focus_phase_rate(
     return info.acoustics.spectrum_sign * rate
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _apply_phase(
-    rows: NDArray[np.complex64], offsets: NDArray[np.float32], rate: NDArray[np.float32]
+    rows: NDArray[np.complex64], first_m: float, step_m: float, rate: NDArray[np.float64]
 ) -> None:  # pragma: no cover
-    for i in range(rows.shape[0]):
-        delta = offsets[i]
-        for k in range(rows.shape[1]):
-            phase = delta * rate[k]
-            rows[i, k] *= np.complex64(complex(math.cos(phase), math.sin(phase)))
+    """Multiply row i by exp(j (first + i step) rate), as a running product that starts anew now and then."""
+    n, length = rows.shape
+    turn, by = np.empty(length, np.complex64), np.empty(length, np.complex64)
+    for k in range(length):
+        by[k] = complex(math.cos(step_m * rate[k]), math.sin(step_m * rate[k]))
+    for i in range(n):
+        if i % _RUN == 0:
+            delta = first_m + i * step_m
+            for k in range(length):
+                turn[k] = complex(math.cos(delta * rate[k]), math.sin(delta * rate[k]))
+        for k in range(length):
+            rows[i, k] *= turn[k]
+            turn[k] *= by[k]
+
+
+@numba.njit(cache=True, nogil=True)
+def _known_pixels(
+    pixels: NDArray[np.complex64], first: int, known: NDArray[np.bool_], rows: NDArray[np.complex64]
+) -> None:  # pragma: no cover
+    """Mark the finite pixels; copy the rows from `first` on, zero where unknown and beyond their end."""
+    n, cols = pixels.shape
+    for i in range(n):
+        for j in range(cols):
+            pixel = pixels[i, j]
+            finite = (abs(pixel.real) < np.inf) & (abs(pixel.imag) < np.inf)
+            known[i, j] = finite
+            if i >= first:
+                rows[i - first, j] = pixel if finite else np.complex64(0)
+        if i >= first:
+            rows[i - first, cols:] = np.complex64(0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _amplitudes(
+    pixels: NDArray[np.complex64],
+    first: int,
+    rows: NDArray[np.complex64],
+    known: NDArray[np.bool_],
+    out: NDArray[np.float32],
+) -> None:  # pragma: no cover
+    """Take the amplitude, of `rows` from row `first` on; NaN where unknown."""
+    n, cols = pixels.shape
+    for i in range(n):
+        line = rows[i - first] if i >= first else pixels[i]
+        for j in range(cols):
+            re, im = line[j].real, line[j].imag
+            out[i, j] = np.sqrt(re * re + im * im) if known[i, j] else np.float32(np.nan)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -72,6 +118,51 @@ def _shrink_rows(known: NDArray[np.bool_], margins: NDArray[np.int64]) -> None: 
         for j in range(cols):
             if j < first + margins[i] or j > last - margins[i]:
                 known[i, j] = False
+
+
+@dataclass(frozen=True, eq=False)
+class _Focused:
+    """A focused view in parts: pixels before row `first` are the view's own, those from there on are `rows`."""
+
+    info: ViewInfo
+    pixels: NDArray[np.complex64]
+    first: int
+    rows: NDArray[np.complex64]
+    known: NDArray[np.bool_]
+
+
+def _focus(view: View, target_m: tuple[float, float], parameters: ShadowParameters | None) -> _Focused:
+    p = parameters or ShadowParameters()
+    info = view.info
+    if not np.iscomplexobj(view.pixels):
+        raise ViewError(f"sub-aperture view has {view.pixels.dtype} pixels; expected complex")
+    r0 = focus_range(info, target_m)
+    pixels = np.ascontiguousarray(view.pixels, dtype=np.complex64)
+    n_rows, cols = pixels.shape
+    offsets = info.down_range_of_rows() - r0
+    # Rows grow down-range: all from the first one behind the focus are.
+    first = n_rows if p.enhancement == "none" else int(np.searchsorted(offsets, 0.0, side="right"))
+    behind = offsets[first:]
+    spacing = info.camera.spacing_m[1]
+    reach = np.ceil(behind * math.tan(info.aperture_rad / 2.0) / spacing).astype(np.int64)
+    # What leaves the view on one side must not come back on the other.
+    length = scipy.fft.next_fast_len(cols + int(min(reach.max(initial=0), cols)))
+    known = np.empty(pixels.shape, np.bool_)
+    rows = np.empty((len(behind), length), np.complex64)
+    _known_pixels(pixels, first, known, rows)
+    if not known.any():
+        raise ViewError("sub-aperture view holds no finite pixel")
+    if len(behind):
+        carrier = float(cross_range_axis(info.aspect_rad) @ np.asarray(info.carrier_rad_m))
+        k_c = 2.0 * math.pi * scipy.fft.fftfreq(length, spacing) + carrier
+        rate = focus_phase_rate(k_c, info, p.enhancement)
+        ducc0.fft.c2c(rows, axes=(1,), out=rows, nthreads=1)
+        _apply_phase(rows, float(behind[0]), float(offsets[-1] - offsets[0]) / (n_rows - 1), rate)
+        ducc0.fft.c2c(rows, axes=(1,), forward=False, inorm=2, out=rows, nthreads=1)
+        margins = np.zeros(n_rows, np.int64)
+        margins[first:] = reach
+        _shrink_rows(known, margins)
+    return _Focused(replace(info, focus_range_m=r0), pixels, first, rows, known)
 
 
 def focus(view: View, target_m: tuple[float, float], parameters: ShadowParameters | None = None) -> View:
@@ -103,35 +194,11 @@ def focus(view: View, target_m: tuple[float, float], parameters: ShadowParameter
     Section 3.2: F = FFT along cross-range, F̃ = F · h(k_c, Δ) for Δ = r - r₀ > 0, inverse FFT. The view is at
     baseband, so k_c is the transform's wavenumber plus the carrier's cross-range part.
     """
-    p = parameters or ShadowParameters()
-    info = view.info
-    if not np.iscomplexobj(view.pixels):
-        raise ViewError(f"sub-aperture view has {view.pixels.dtype} pixels; expected complex")
-    known = np.isfinite(view.pixels)
-    if not known.any():
-        raise ViewError("sub-aperture view holds no finite pixel")
-    r0 = focus_range(info, target_m)
-    pixels = view.pixels.astype(np.complex64)
-    offsets = info.down_range_of_rows() - r0
-    behind = np.flatnonzero(offsets > 0.0)
-    if p.enhancement != "none" and behind.size:
-        cols = info.camera.cols
-        spacing = info.camera.spacing_m[1]
-        reach = np.ceil(offsets[behind] * math.tan(info.aperture_rad / 2.0) / spacing).astype(np.int64)
-        # What leaves the view on one side must not come back on the other.
-        length = scipy.fft.next_fast_len(cols + int(min(reach.max(), cols)))
-        rows = np.where(known[behind], pixels[behind], np.complex64(0))
-        spectrum = scipy.fft.fft(rows, n=length, axis=1, overwrite_x=True)
-        carrier = float(cross_range_axis(info.aspect_rad) @ np.asarray(info.carrier_rad_m))
-        k_c = 2.0 * math.pi * scipy.fft.fftfreq(length, spacing) + carrier
-        rate = focus_phase_rate(k_c, info, p.enhancement)
-        _apply_phase(spectrum, offsets[behind].astype(np.float32), rate.astype(np.float32))
-        pixels[behind] = scipy.fft.ifft(spectrum, axis=1, overwrite_x=True)[:, :cols]
-        margins = np.zeros(info.camera.rows, np.int64)
-        margins[behind] = reach
-        _shrink_rows(known, margins)
-    pixels[~known] = np.complex64(complex(math.nan, math.nan))
-    return View(replace(info, focus_range_m=r0), pixels)
+    f = _focus(view, target_m, parameters)
+    pixels = f.pixels.copy()
+    pixels[f.first :] = f.rows[:, : pixels.shape[1]]
+    pixels[~f.known] = np.complex64(complex(math.nan, math.nan))
+    return View(f.info, pixels)
 
 
 def enhance(view: View, target_m: tuple[float, float], parameters: ShadowParameters | None = None) -> View:
@@ -147,5 +214,7 @@ def enhance(view: View, target_m: tuple[float, float], parameters: ShadowParamet
     ViewError
         If the view is not complex or holds nothing.
     """
-    focused = focus(view, target_m, parameters)
-    return replace(focused, pixels=np.abs(focused.pixels))
+    f = _focus(view, target_m, parameters)
+    amplitude = np.empty(f.pixels.shape, np.float32)
+    _amplitudes(f.pixels, f.first, f.rows, f.known, amplitude)
+    return View(f.info, amplitude)

@@ -8,7 +8,8 @@ of seabed, however bright or dark, does not. "No object" is a valid answer.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from .carving import Carver
 from .errors import NoTargetError, SpectrumSignError, ViewError
-from .geometry import CoherentImage, Track, View
+from .geometry import TWO_PI, CoherentImage, ShadowCamera, Track, View
 from .likelihood import outside_likelihood
 from .parameters import (
     CarvingParameters,
@@ -118,20 +119,35 @@ def search_views(views: Sequence[View]) -> Search:
     """
     if not views:
         raise NoTargetError("there is no view to find a target in; expected views from several aspects")
-    camera = views[0].info.camera
     extent = _known_extent(views)
-    middle = camera.pixel_to_ground[:2] @ np.array([(camera.cols - 1) / 2.0, (camera.rows - 1) / 2.0, 1.0])
-    voxel = extent / _SEARCH_VOXELS
-    # Higher bodies throw their shadows off the image, whose voxels stay unknown then.
-    height = min(0.75 * extent * math.tan(camera.grazing_rad), 0.5 * float(camera.sonar_m[2]))
-    volume = Volume.around((float(middle[0]), float(middle[1])), (extent, extent, height), voxel)
-    smoothing = LikelihoodParameters(smoothing_m=max(voxel, 3.0 * max(camera.spacing_m)))
-    carver = Carver(volume, CarvingParameters(method="soft", min_views_fraction=0.3))
-    for view in views:
+    return _search(_search_likelihoods(list(views), extent), views[0].info.camera, extent)
+
+
+def _search_likelihoods(views: list[View], extent_m: float, workers: int = 2) -> list[View]:
+    """Turn amplitude views into smoothed likelihoods; empties the list, as both at once would be much memory."""
+    smoothing_m = max(extent_m / _SEARCH_VOXELS, 3.0 * max(views[0].info.camera.spacing_m))
+    parameters = LikelihoodParameters(smoothing_m=smoothing_m)
+
+    def likelihood(_: int) -> View | None:
+        view = views.pop()
         try:
-            likelihood = outside_likelihood(view, smoothing)
+            return outside_likelihood(view, parameters)
         except ViewError:
-            continue  # a view without levels has nothing to say here; it is reported where it counts
+            return None  # a view without levels has nothing to say here; it is reported where it counts
+
+    with ThreadPoolExecutor(workers) as pool:
+        return [view for view in pool.map(likelihood, range(len(views))) if view is not None]
+
+
+def _search(likelihoods: Iterable[View], camera: ShadowCamera, extent_m: float) -> Search:
+    """Carve the whole scene coarsely and list its bodies; `camera` is any of the views'."""
+    middle = camera.pixel_to_ground[:2] @ np.array([(camera.cols - 1) / 2.0, (camera.rows - 1) / 2.0, 1.0])
+    voxel = extent_m / _SEARCH_VOXELS
+    # Higher bodies throw their shadows off the image, whose voxels stay unknown then.
+    height = min(0.75 * extent_m * math.tan(camera.grazing_rad), 0.5 * float(camera.sonar_m[2]))
+    volume = Volume.around((float(middle[0]), float(middle[1])), (extent_m, extent_m, height), voxel)
+    carver = Carver(volume, CarvingParameters(method="soft", min_views_fraction=0.3))
+    for likelihood in likelihoods:
         carver.integrate(likelihood)
     mean = carver.likelihood()
     return Search(tuple(_bodies(mean, volume)), volume, mean)
@@ -179,16 +195,27 @@ def _bodies(likelihood: NDArray[np.float32], volume: Volume) -> list[Target]:
     return sorted(found, key=lambda target: -target.evidence)
 
 
-def _search_image(image: CoherentImage, track: Track, spectrum: Spectrum) -> Search | None:
+def _searching(image: CoherentImage, track: Track, spectrum: Spectrum) -> SubApertures:
     parameters = SubApertureParameters(aperture_deg=_SEARCH_APERTURE_DEG, step_deg=_SEARCH_STEP_DEG)
-    sub_apertures = SubApertures(image, track, parameters, spectrum=spectrum)
+    return SubApertures(image, track, parameters, spectrum=spectrum)
+
+
+def _views_of_search(sub_apertures: SubApertures, workers: int = 2) -> list[View]:
+    """Make the amplitude views that search; none where the track has a gap."""
     unfocused = ShadowParameters(enhancement="none")
-    views = []
-    for index in range(len(sub_apertures)):
+
+    def view(aspect: float) -> View | None:
         try:
-            views.append(enhance(sub_apertures.view(index), (0.0, 0.0), unfocused))
+            return enhance(sub_apertures.view_of_aspect(aspect), (0.0, 0.0), unfocused)
         except ViewError:
-            continue  # a gap in the track
+            return None
+
+    with ThreadPoolExecutor(workers) as pool:
+        return [v for v in pool.map(view, map(float, sub_apertures.aspects_rad)) if v is not None]
+
+
+def _search_image(image: CoherentImage, track: Track, spectrum: Spectrum) -> Search | None:
+    views = _views_of_search(_searching(image, track, spectrum))
     return search_views(views) if views else None
 
 
@@ -336,8 +363,24 @@ def spectrum_sign_evidence(
         The search under the stated sign, so that it need not be repeated.
     """
     spectrum = spectrum or Spectrum.of_image(image)
-    stated = _search_image(image, track, spectrum)
-    acoustics = replace(image.acoustics, spectrum_sign=-image.acoustics.spectrum_sign)
-    other = _search_image(replace(image, acoustics=acoustics), track, spectrum)
-    scores = [s.best.evidence if s is not None and s.best is not None else 0.0 for s in (stated, other)]
-    return SignEvidence(image.acoustics.spectrum_sign, scores[0], scores[1]), stated
+    sign = image.acoustics.spectrum_sign
+    views = _views_of_search(_searching(image, track, spectrum))
+    if not views:
+        return SignEvidence(sign, 0.0, 0.0), None
+    camera, extent = views[0].info.camera, _known_extent(views)
+    likelihoods = _search_likelihoods(views, extent)
+    other_image = replace(image, acoustics=replace(image.acoustics, spectrum_sign=-sign))
+    turned = _under_other_sign(likelihoods, _searching(other_image, track, spectrum))
+    stated, other = _search(likelihoods, camera, extent), _search(turned, camera, extent)
+    scores = [s.best.evidence if s.best is not None else 0.0 for s in (stated, other)]
+    return SignEvidence(sign, scores[0], scores[1]), stated
+
+
+def _under_other_sign(views: Sequence[View], other: SubApertures) -> Iterator[View]:
+    """Give the views of the other spectrum sign: that of aspect θ is that of θ + π, turned by 180°."""
+    for view in views:
+        try:
+            info = other.info(float((view.info.aspect_rad + math.pi) % TWO_PI))
+        except ViewError:
+            continue
+        yield View(info, view.pixels[::-1, ::-1])
