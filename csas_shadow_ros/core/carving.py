@@ -29,6 +29,7 @@ from .echo import echo_zone, opaque_part
 from .errors import ParameterError, ViewError
 from .geometry import View, ViewInfo
 from .parameters import CarvingParameters
+from .threads import in_order
 from .threshold import least_views_fraction, thresholded
 from .volume import Volume, VoxelGrid
 
@@ -39,9 +40,11 @@ _SCALE = 4096
 MASK_OUTSIDE, MASK_COVERED, MASK_UNKNOWN, MASK_SHADOW = 0, 64, 128, 255
 #: The second look is taken so many voxels round what the first one left.
 _SECOND_LOOK_VOXELS = 2
+#: Threads that do it.
+_LOOKERS = 2
 #: Voxels a side of the square blocks of a slice that are counted as one where a mask allows it.
 _BLOCK = 16
-#: What an unknown pixel adds to the sums over a mask; blocks whose pixels are more than that are not looked up.
+#: What an unknown pixel adds to the sums over a mask; blocks of more pixels than that are not looked up.
 _UNKNOWN = 1 << 16
 _NOWHERE = np.empty((0, 0), np.bool_)
 
@@ -110,9 +113,9 @@ def _cells_of_mask(
     """Code the cells between four pixels of a part of a mask, and sum its pixels up.
 
     `first` is the part's first (row, col). A cell has a bit for each of its pixels that is outside the
-    silhouette, and the fifth for any that is unknown; covered pixels are unknown in `echo` (everywhere if that is
-    empty), outside elsewhere. `sums[v, u]` is the sum of the pixels above v and left of u: 1 outside, 2¹⁶ unknown,
-    modulo 2³².
+    silhouette, and the fifth for any that is unknown; covered pixels are unknown in `echo` (everywhere if
+    that is empty), outside elsewhere. `sums[v, u]` is the sum of the pixels above v and left of u: 1 outside,
+    2¹⁶ unknown, modulo 2³².
     """
     rows, cols = cells.shape
     v0, u0 = first
@@ -172,7 +175,7 @@ def _carve_masks(
             for bi in range(block_total.shape[2]):
                 i0 = bi * _BLOCK
                 i1 = min(i0 + _BLOCK, nx)
-                # The block's pixels, and one more all round: rounding, and the neighbours that are interpolated.
+                # The block's pixels, and one more all round: rounding, and neighbours in interpolation.
                 u = a[0, 0] * x0 + a[0, 1] * y + a[0, 2] + i0 * du
                 v = a[1, 0] * x0 + a[1, 1] * y + a[1, 2] + i0 * dv
                 ru, rv = (i1 - 1 - i0) * du, (i1 - 1 - i0) * dv
@@ -238,6 +241,11 @@ class KeptMask:
         """Keep a mask."""
         return cls(view.info, lz4.block.compress(np.ascontiguousarray(view.pixels)))
 
+    @property
+    def grazing_quarters(self) -> int:
+        """Grazing angle in quarters of a degree."""
+        return round(math.degrees(self.info.camera.grazing_rad) * 4.0)
+
     def view(self) -> View:
         """Return the mask as it was."""
         pixels = np.frombuffer(lz4.block.decompress(self.packed), np.uint8)
@@ -278,9 +286,7 @@ class _Sums:
 
         _threads(self._pool, work, v.shape[0])
 
-    def add_mask(
-        self, pixels: NDArray[np.uint8], info: ViewInfo, echo: NDArray[np.bool_] = _NOWHERE
-    ) -> None:
+    def add_mask(self, pixels: NDArray[np.uint8], info: ViewInfo, echo: NDArray[np.bool_] = _NOWHERE) -> None:
         """Add a mask: 1 outside the silhouette, 0 inside; covered pixels are outside except in `echo`."""
         v = self._volume
         affines = _slice_affines(info, v)
@@ -314,12 +320,12 @@ class _Sums:
     @property
     def total(self) -> NDArray[np.int32]:
         """Sum of all images, in 1/4096, shape (nz, ny, nx)."""
-        return self._total + self._spread(self._block_total)
+        return np.asarray(self._total + self._spread(self._block_total), np.int32)
 
     @property
     def count(self) -> NDArray[np.uint16]:
         """Number of images that know something of each voxel, shape (nz, ny, nx)."""
-        return self._count + self._spread(self._block_count)
+        return np.asarray(self._count + self._spread(self._block_count), np.uint16)
 
     def _spread(self, blocks: NDArray[Any]) -> NDArray[Any]:
         _, ny, nx = self._volume.shape
@@ -358,8 +364,8 @@ class Carver:
 
     Notes
     -----
-    Memory is that of the grid (6 bytes a voxel), however many views are integrated; the consensus method also
-    keeps the silhouettes, compressed to some kB each, for its second look.
+    Memory is that of the grid (a little over 6 bytes a voxel), however many views are integrated; the consensus
+    method also keeps the silhouettes, compressed to some kB each, for its second look.
     """
 
     def __init__(
@@ -459,17 +465,20 @@ class Carver:
         body = first.occupied[box]
         sums = _Sums(part, self._pool)
         opaque: dict[int, NDArray[np.bool_]] = {}
-        for stamp in sorted(self._masks):
-            kept = self._masks[stamp]
-            pixels = kept.view().pixels
-            zone = _NOWHERE
-            if (pixels == MASK_COVERED).any():
-                # The grazing angle hardly changes round the circle: one body a quarter of a degree.
-                quarters = round(math.degrees(kept.info.camera.grazing_rad) * 4.0)
-                if quarters not in opaque:
-                    opaque[quarters] = opaque_part(body, math.radians(quarters / 4.0))
-                zone = echo_zone(kept.info, part, body, opaque[quarters])
-            sums.add_mask(pixels, kept.info, zone)
+        for kept in self._masks.values():
+            # The grazing angle hardly changes round the circle: one body a quarter of a degree.
+            quarters = kept.grazing_quarters
+            if quarters not in opaque:
+                opaque[quarters] = opaque_part(body, math.radians(quarters / 4.0))
+
+        def look(kept: KeptMask) -> tuple[View, NDArray[np.bool_]]:
+            view = kept.view()
+            if not (view.pixels == MASK_COVERED).any():
+                return view, _NOWHERE
+            return view, echo_zone(kept.info, part, body, opaque[kept.grazing_quarters])
+
+        for _, (view, zone) in in_order(look, self._masks.values(), _LOOKERS):
+            sums.add_mask(view.pixels, view.info, zone)
         likelihood, views = first.likelihood.copy(), first.views.copy()
         likelihood[box] = _mean(sums.total, sums.count, self.parameters, len(self.stamps))
         views[box] = sums.count

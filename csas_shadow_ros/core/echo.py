@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numba
 import numpy as np
 import scipy.ndimage
@@ -164,9 +165,9 @@ def _mark_echoes(
     sonar: NDArray[np.float64],
     layover: NDArray[np.float64],
     affine: NDArray[np.float64],
-    reach: NDArray[np.int64],
     out: BoolArray,
 ) -> None:  # pragma: no cover
+    """Mark the pixels that voxels in view are imaged on."""
     nz, ny, nx = occupied.shape
     rows, cols = out.shape
     for k in range(nz):
@@ -175,17 +176,16 @@ def _mark_echoes(
                 if not occupied[k, j, i]:
                     continue
                 x, y, z = origin[0] + i * step, origin[1] + j * step, origin[2] + k * step
-                di, dj, dk = sonar[0] - x, sonar[1] - y, sonar[2] - z
-                length = 2.0 * max(abs(di), abs(dj), abs(dk))  # half a voxel a step
-                di, dj, dk = di / length, dj / length, dk / length
-                if not _seen(opaque, i, j, k, di, dj, dk, 0.0):
-                    continue
                 px, py = x + z * layover[0], y + z * layover[1]
                 u = math.floor(affine[0, 0] * px + affine[0, 1] * py + affine[0, 2] + 0.5)
                 v = math.floor(affine[1, 0] * px + affine[1, 1] * py + affine[1, 2] + 0.5)
-                for b in range(max(0, v - reach[0]), min(rows, v + reach[0] + 1)):
-                    for a in range(max(0, u - reach[1]), min(cols, u + reach[1] + 1)):
-                        out[b, a] = True
+                if u < 0 or v < 0 or u >= cols or v >= rows or out[v, u]:
+                    continue
+                di, dj, dk = sonar[0] - x, sonar[1] - y, sonar[2] - z
+                length = 2.0 * max(abs(di), abs(dj), abs(dk))  # half a voxel a step
+                di, dj, dk = di / length, dj / length, dk / length
+                if _seen(opaque, i, j, k, di, dj, dk, 0.0):
+                    out[v, u] = True
 
 
 def echo_zone(info: ViewInfo, volume: Volume, occupied: BoolArray, opaque: BoolArray) -> BoolArray:
@@ -211,15 +211,15 @@ def echo_zone(info: ViewInfo, volume: Volume, occupied: BoolArray, opaque: BoolA
     Layover: (x, y) + z tan ψ û(θ).
     """
     camera = info.camera
-    out = np.zeros(camera.shape, np.bool_)
     half = volume.voxel_size_m / 2.0
-    reach = np.array(
-        [
-            math.ceil((half + cells * cell) / spacing)
-            for cells, cell, spacing in zip(_RESPONSE_CELLS, info.resolution_m, camera.spacing_m, strict=True)
-        ],
-        np.int64,
+    rows, cols = (
+        math.ceil((half + cells * cell) / spacing)
+        for cells, cell, spacing in zip(_RESPONSE_CELLS, info.resolution_m, camera.spacing_m, strict=True)
     )
+    # Echoes beside the view reach into it.
+    out = np.zeros((camera.rows + 2 * rows, camera.cols + 2 * cols), np.bool_)
+    affine = np.array(camera.ground_to_pixel[:2])
+    affine[:, 2] += (cols, rows)
     _mark_echoes(
         occupied,
         opaque,
@@ -227,8 +227,9 @@ def echo_zone(info: ViewInfo, volume: Volume, occupied: BoolArray, opaque: BoolA
         volume.voxel_size_m,
         np.asarray(camera.sonar_m, dtype=np.float64),
         layover_per_metre(info),
-        np.ascontiguousarray(camera.ground_to_pixel[:2]),
-        reach,
+        affine,
         out,
     )
-    return out
+    box = np.ones((2 * rows + 1, 2 * cols + 1), np.uint8)
+    zone = cv2.dilate(out.view(np.uint8), box).view(np.bool_)
+    return np.ascontiguousarray(zone[rows : rows + camera.rows, cols : cols + camera.cols])

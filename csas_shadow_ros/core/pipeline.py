@@ -8,11 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeVar
 
 import numpy as np
 import trimesh
@@ -40,10 +37,8 @@ from .segmentation import require_silhouette, segment_shadow
 from .shadow import enhance
 from .subaperture import Spectrum, SubApertures
 from .target import SignEvidence, Target, choose_target, find_target_and_others, spectrum_sign_evidence
+from .threads import in_order
 from .volume import Volume, VoxelGrid
-
-In = TypeVar("In")
-Out = TypeVar("Out")
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,17 +293,3 @@ def _integrate(result: Result, carvers: list[Carver], view: ProcessedView) -> No
     levels = view.levels
     result.levels[view.shadow.info.stamp_ns] = (levels.seabed_level, levels.contrast, levels.estimated)
     result.looks[view.shadow.info.stamp_ns] = view.look
-
-
-def in_order(function: Callable[[In], Out], items: Iterable[In], workers: int) -> Iterator[tuple[In, Out]]:
-    """Apply a function in threads, at most a few items ahead, and give the results in order."""
-    waiting: deque[tuple[In, Future[Out]]] = deque()
-    with ThreadPoolExecutor(workers) as pool:
-        for item in items:
-            waiting.append((item, pool.submit(function, item)))
-            if len(waiting) > 2 * workers:
-                first, future = waiting.popleft()
-                yield first, future.result()
-        while waiting:
-            first, future = waiting.popleft()
-            yield first, future.result()

@@ -89,23 +89,6 @@ def _known_pixels(
 
 
 @numba.njit(cache=True, nogil=True)
-def _amplitudes(
-    pixels: NDArray[np.complex64],
-    first: int,
-    rows: NDArray[np.complex64],
-    known: NDArray[np.bool_],
-    out: NDArray[np.float32],
-) -> None:  # pragma: no cover
-    """Take the amplitude, of `rows` from row `first` on; NaN where unknown."""
-    n, cols = pixels.shape
-    for i in range(n):
-        line = rows[i - first] if i >= first else pixels[i]
-        for j in range(cols):
-            re, im = line[j].real, line[j].imag
-            out[i, j] = np.sqrt(re * re + im * im) if known[i, j] else np.float32(np.nan)
-
-
-@numba.njit(cache=True, nogil=True)
 def _shrink_rows(known: NDArray[np.bool_], margins: NDArray[np.int64]) -> None:  # pragma: no cover
     """Drop `margins[i]` pixels from both ends of each row's known interval (and all beyond)."""
     cols = known.shape[1]
@@ -122,7 +105,7 @@ def _shrink_rows(known: NDArray[np.bool_], margins: NDArray[np.int64]) -> None: 
 
 @dataclass(frozen=True, eq=False)
 class _Focused:
-    """A focused view in parts: pixels before row `first` are the view's own, those from there on are `rows`."""
+    """A focused view in parts: up to row `first` its pixels are the view's own, from there on `rows`."""
 
     info: ViewInfo
     pixels: NDArray[np.complex64]
@@ -216,5 +199,8 @@ def enhance(view: View, target_m: tuple[float, float], parameters: ShadowParamet
     """
     f = _focus(view, target_m, parameters)
     amplitude = np.empty(f.pixels.shape, np.float32)
-    _amplitudes(f.pixels, f.first, f.rows, f.known, amplitude)
+    np.abs(f.pixels[: f.first], out=amplitude[: f.first])
+    behind: NDArray[np.complex64] = f.rows[:, : f.info.camera.cols]
+    np.abs(behind, out=amplitude[f.first :])
+    np.putmask(amplitude, ~f.known, np.float32(np.nan))
     return View(f.info, amplitude)

@@ -20,10 +20,11 @@ from .likelihood import Levels, outside_likelihood, view_levels
 from .measurement import SilhouetteSides, levels_of_mask, measure_object, silhouette_sides
 from .mesh import mesh_from_grid
 from .parameters import PipelineParameters, ShadowParameters, TargetParameters
-from .pipeline import Result, compose, in_order, open_hollows
+from .pipeline import Result, compose, open_hollows
 from .segmentation import require_silhouette, segment_shadow
 from .shadow import enhance
 from .target import Search, Target, choose_target, search_views
+from .threads import in_order
 from .volume import Volume
 
 #: Stages that a run can start from, first to last.

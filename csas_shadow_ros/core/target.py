@@ -124,7 +124,7 @@ def search_views(views: Sequence[View]) -> Search:
 
 
 def _search_likelihoods(views: list[View], extent_m: float, workers: int = 2) -> list[View]:
-    """Turn amplitude views into smoothed likelihoods; empties the list, as both at once would be much memory."""
+    """Turn amplitude views into smoothed likelihoods; empties the list, as both would be much memory."""
     smoothing_m = max(extent_m / _SEARCH_VOXELS, 3.0 * max(views[0].info.camera.spacing_m))
     parameters = LikelihoodParameters(smoothing_m=smoothing_m)
 
