@@ -364,8 +364,8 @@ class Carver:
 
     Notes
     -----
-    Memory is that of the grid (a little over 6 bytes a voxel), however many views are integrated; the consensus
-    method also keeps the silhouettes, compressed to some kB each, for its second look.
+    Memory is that of the grid (a little over 6 bytes a voxel), however many views are integrated; consensus
+    carving also keeps the silhouettes, compressed to some kB each, for its second look.
     """
 
     def __init__(

@@ -329,6 +329,46 @@ def test_there_is_nothing_to_carve_without_views():
         carve([], SMALL)
 
 
+def patchy_masks(size, n=10):
+    """Return masks of large patches, so that whole blocks of voxels see the same, cut by image edges."""
+    rng = np.random.default_rng(5)
+    values = np.array([0, 64, 128, 255, 255, 0], np.uint8)
+    for i in range(n):
+        info = make_info(0.2 + 2 * math.pi * i / n, size=size, spacing_m=0.012)
+        coarse = rng.choice(values, (4, 4))
+        yield View(info, np.kron(coarse, np.ones((size // 4, size // 4), np.uint8)))
+
+
+@pytest.mark.parametrize("size", [240, 120])
+def test_each_voxel_counts_what_a_bilinear_look_at_its_own_pixel_says(size):
+    volume = Volume.around((0.05, -0.1), (1.3, 0.9, 0.4), 0.02)
+    views = list(patchy_masks(size))
+    c = carver("hard", volume, min_views_fraction=0.0, threshold=0.5)
+    z, y, x = np.meshgrid(volume.z_m, volume.y_m, volume.x_m, indexing="ij")
+    total, count = np.zeros(volume.shape), np.zeros(volume.shape, int)
+    for view in views:
+        c.integrate(view)
+        outside = np.where(view.pixels == 255, 0.0, 1.0)
+        outside[(view.pixels == 128) | (view.pixels == 64)] = np.nan
+        uv = view.info.camera.project(np.stack([x, y, z], axis=-1))
+        u, v = uv[..., 0], uv[..., 1]
+        inside = (u >= 0) & (v >= 0) & (u <= size - 1) & (v <= size - 1)
+        i, j = (np.clip(np.floor(w), 0, size - 2).astype(int) for w in (v, u))
+        f, g = v - i, u - j
+        value = (outside[i, j] * (1 - g) + outside[i, j + 1] * g) * (1 - f)
+        value += (outside[i + 1, j] * (1 - g) + outside[i + 1, j + 1] * g) * f
+        known = inside & np.isfinite(value)
+        total[known] += value[known]
+        count += known
+    grid = c.grid()
+    assert len(np.unique(count)) > 3
+    # Voxels that fall on a line between pixels within rounding may go either way.
+    assert (grid.views != count).mean() < 1e-4
+    known = (count > 0) & (grid.views == count)
+    assert np.abs(grid.likelihood - total / np.maximum(count, 1))[known].max() < 1e-3
+    assert np.isnan(grid.likelihood[grid.views == 0]).all()
+
+
 def test_a_grid_is_a_picture_of_the_moment():
     views = random_views()
     c = carver()

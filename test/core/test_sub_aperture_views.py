@@ -348,3 +348,15 @@ def test_a_size_that_does_not_transform_fast_gives_the_same_views():
     )
     truth = on_carrier(a)[near]
     assert normalised_rms(filled, truth, np.ones(truth.shape, bool)) < 0.08
+
+
+def test_the_view_of_the_other_sign_is_that_of_the_opposite_aspect_turned_by_180_degrees():
+    image = band_limited_image(1)
+    claimed = CoherentImage(image.pixels, image.grid, acoustics(-1))
+    other = SubApertures(claimed, circle_track(), sub_apertures(1).parameters)
+    view = other.view_of_aspect(math.radians(33.0)).pixels
+    turned = sub_apertures(1).view_of_aspect(math.radians(213.0)).pixels[::-1, ::-1]
+    known = np.isfinite(view) & np.isfinite(turned)
+    assert known.mean() > 0.3
+    assert (np.isfinite(view) ^ np.isfinite(turned)).mean() < 0.01
+    assert normalised_rms(np.abs(view), np.abs(turned), known) < 1e-3
