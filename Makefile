@@ -15,6 +15,8 @@ DEMO_OUT ?= results/demo
 PYTEST_WORKERS ?= 2
 # More arguments of the accuracy benchmark: make accuracy ACCURACY_ARGUMENTS=--resume
 ACCURACY_ARGUMENTS ?=
+# And of the speed benchmark: make bench BENCH_ARGUMENTS='--only chain carving'
+BENCH_ARGUMENTS ?=
 
 # ROS 2 from PyPI needs its prefix named, stays on this machine, and wants a place for its logs.
 export AMENT_PREFIX_PATH := $(abspath $(VENV))$(if $(AMENT_PREFIX_PATH),:$(AMENT_PREFIX_PATH))
@@ -26,7 +28,7 @@ SOURCES := $(shell find csas_shadow_ros msg_adapters config launch -type f \
 	-not -name '*.pyc' -not -path '*/__pycache__*' 2>/dev/null)
 PACKAGING := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help venv install demo test lint types unit accuracy accuracy-short build clean
+.PHONY: help venv install demo test lint types unit accuracy accuracy-short bench build clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -73,6 +75,11 @@ accuracy-short: install ## a few cases of it against their floors, in a minute
 
 accuracy: install ## the accuracy benchmark: writes docs/accuracy.md
 	$(PY) benchmarks/accuracy.py $(ACCURACY_ARGUMENTS)
+
+bench: install ## the speed benchmark: a table of bounds, docs/performance.json and figure
+	@mkdir -p $(ROS_LOG_DIR)
+	$(PY) -m pip install --quiet --disable-pip-version-check '.[bench]'
+	OPENBLAS_NUM_THREADS=1 $(PY) benchmarks/speed.py $(BENCH_ARGUMENTS)
 
 $(COLCON_VENV)/.installed: setup.py
 	@test -n "$(PYTHON)" || { echo "no Python 3.10 to 3.13 with venv found: name one, make PYTHON=..." >&2; exit 1; }

@@ -41,6 +41,8 @@ CORE = [
 # (apt, conda, source) this extra is not needed and would be in the way.
 ROS = ["ros-rclpy==7.1.6", "ros-rmw-fastrtps-cpp==8.4.3", "ros-common-interfaces==5.3.6"]
 TEST = ["pytest>=8", "pytest-xdist>=3.5", "hypothesis>=6.100", "ruff~=0.17.6", "mypy~=2.4.1"]
+# The benchmark compares with the fastest FFT library that can be had: a floor to measure against.
+BENCH = ["pyfftw>=0.14"]
 # setuptools 80 dropped what colcon's --symlink-install calls.
 BUILD = ["colcon-common-extensions>=0.3", "setuptools>=68,<80"]
 
@@ -113,7 +115,7 @@ setup(
         *node_scripts(),
     ],
     install_requires=CORE,
-    extras_require={"ros": ROS, "test": TEST, "build": BUILD, "dev": TEST + BUILD},
+    extras_require={"ros": ROS, "test": TEST, "bench": BENCH, "build": BUILD, "dev": TEST + BUILD},
     entry_points={
         "console_scripts": [
             "csas-shadow = csas_shadow_ros.cli:main",
