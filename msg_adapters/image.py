@@ -176,8 +176,11 @@ def image_to_msg(
     if pixels.ndim != (2 if flat else 3) or (not flat and pixels.shape[2] != channels):
         expected = "(rows, cols)" if flat else f"(rows, cols, {channels})"
         raise AdapterError(f"{where} has shape {pixels.shape}; expected {expected} for {encoding}")
-    check_pixels(pixels, kind)
     rows, cols = pixels.shape[:2]
+    size = rows * cols * channels * np.dtype(scalar).itemsize
+    if size > MAX_BYTES:
+        raise AdapterError(f"{where} of {pixels.shape} pixels has {size} bytes; expected at most {MAX_BYTES}")
+    check_pixels(pixels, kind)
     if is_complex:
         if not np.iscomplexobj(pixels):
             raise AdapterError(f"{where} holds {pixels.dtype}; expected complex numbers for {encoding}")

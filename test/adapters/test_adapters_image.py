@@ -342,3 +342,9 @@ def test_any_header_over_any_bytes_reads_or_is_refused_but_never_fails_otherwise
         return
     assert pixels.shape == (height, width)
     assert pixels.dtype == np.complex64
+
+
+def test_an_image_that_no_message_can_hold_is_refused_before_it_is_copied(factory):
+    vast = np.broadcast_to(np.uint8(7), (1 << 16, 1 << 15, 3))
+    with pytest.raises(AdapterError, match=r"color_by_aspect/image .* has 6442450944 bytes; expected"):
+        image_to_msg(factory, vast, 1, "color_by_aspect")
