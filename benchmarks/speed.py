@@ -36,6 +36,7 @@ import scipy.fft
 import scipy.ndimage
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from csas_shadow_ros.bags import read_run
 from csas_shadow_ros.core import reference
@@ -508,6 +509,8 @@ def draw_growth(growth: Report) -> None:
         axes.loglog(n, t, "o-", label=f"measured, n^{values['exponent']:.2f}")
         axes.loglog(n, shape * t[-1] / shape[-1], "--", color="0.5", label=f"∝ {law}")
         axes.set_xlabel(name)
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.yaxis.set_minor_formatter(NullFormatter())
         axes.set_ylabel("CPU time [s]")
         axes.legend()
         axes.grid(which="both", alpha=0.3)
