@@ -38,12 +38,15 @@ FloatArray = NDArray[np.float64]
 
 #: Rows of a silhouette's side whose edge is so many pixels from the outermost take part.
 _SIDE_PX = 5.0
+_MEDIAN_ROWS = 9
 #: Columns on either side of the edge that its mean place is taken from.
 _HALF_PX = 6
 #: A side that is drawn in by less than this over its rows is straight along range (pixels).
 _TAPER_PX = 2.5
 #: A side whose middle stands out by more than this is round (pixels).
 _BULGE_PX = 0.8
+#: The side of what is round stands out most within this share of its rows; else it tapers.
+_BULGE_WITHIN = 0.8
 #: Fewer rows than this give no edge.
 _MIN_ROWS = 8
 #: Directions that a plan's sides may face, and looks over an aperture.
@@ -132,7 +135,7 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
     e_c = cross_range_axis(info.aspect_rad)
     directions, supports = [], []
     for sign, edge in ((1, last), (-1, first)):
-        found = _side(levels, rows, sign * (edge - u0) * scale, scale, sign, u0)
+        found = _side(levels, rows, sign * (edge - u0) * scale, scale, sign, (u0, v0))
         if found is None:
             continue
         out, straight = found
@@ -158,18 +161,26 @@ def _largest_piece(shadow: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
 
 
 def _side(
-    levels: Levels, rows: NDArray[np.intp], out_px: FloatArray, scale: FloatArray, sign: int, u0: float
+    levels: Levels,
+    rows: NDArray[np.intp],
+    out_px: FloatArray,
+    scale: FloatArray,
+    sign: int,
+    target_px: tuple[float, float],
 ) -> tuple[float, bool] | None:
     """Return how far out a side reaches (pixels from column u0, at the target's range); if it is straight.
 
     None where too little of it is seen.
     """
-    kept = np.abs(out_px - np.percentile(out_px, 90)) <= _SIDE_PX
+    # By a running median: choosing rows by their own edges would favour those that err outwards.
+    calm = scipy.ndimage.median_filter(out_px, _MEDIAN_ROWS, mode="nearest")
+    kept = np.abs(calm - np.percentile(calm, 90)) <= _SIDE_PX
     if kept.sum() < _MIN_ROWS:
         return None
     rows, out_px, scale = rows[kept], out_px[kept], scale[kept]
+    u0, v0 = target_px
     along = rows - rows.mean()
-    curve, straight = _fitted_side(along, out_px)
+    curve, straight, slope = _fitted_side(along, out_px)
     # The mean profile across the edge, rows laid over one another along the fitted side.
     steps = np.arange(-_HALF_PX, _HALF_PX + 1)
     columns = np.round(u0 + sign * (curve[:, None] + steps) / scale[:, None]).astype(np.intp)
@@ -183,11 +194,14 @@ def _side(
     shadow_power = 1.0 / levels.contrast**2
     dark = np.clip((1.0 - power) / (1.0 - shadow_power), -0.5, 1.2)
     edge = -_HALF_PX - 0.5 + float(dark.sum()) + float((offsets - steps).mean())
-    return (float(curve[0]) if straight else float(curve.max())) + edge, straight
+    # The target's echo hides the foot of a side that is drawn in upwards: its shadow would begin at the
+    # target's own range.
+    hidden = min(max(0.0, float(rows[0]) - v0), float(rows[-1] - rows[0]))
+    return float(curve.max()) + max(0.0, -slope) * hidden + edge, straight
 
 
-def _fitted_side(along: FloatArray, out_px: FloatArray) -> tuple[FloatArray, bool]:
-    """Fit a side: straight along range, else tapering, else round; say whether it is straight."""
+def _fitted_side(along: FloatArray, out_px: FloatArray) -> tuple[FloatArray, bool, float]:
+    """Fit a side: straight along range, else tapering, else round; say if it is straight, and its taper."""
     weight = np.ones_like(out_px)
     slope = level = 0.0
     for _ in range(5):
@@ -202,11 +216,12 @@ def _fitted_side(along: FloatArray, out_px: FloatArray) -> tuple[FloatArray, boo
     design = np.stack([np.ones_like(along), along / reach, (along / reach) ** 2], axis=1)
     bend, *_ = np.linalg.lstsq(design * weight[:, None], out_px * weight, rcond=None)
     curve = design @ bend
-    if bend[2] < 0.0 and float(curve.max()) - mean > _BULGE_PX:
-        return np.asarray(curve), False
+    within = bend[2] < 0.0 and abs(bend[1] / (2.0 * bend[2])) < _BULGE_WITHIN
+    if within and float(curve.max()) - mean > _BULGE_PX:
+        return np.asarray(curve), False, 0.0
     if abs(slope) * float(np.ptp(along)) >= _TAPER_PX:
-        return np.asarray(level + slope * along), False
-    return np.full_like(out_px, mean), True
+        return np.asarray(level + slope * along), False, slope
+    return np.full_like(out_px, mean), True, 0.0
 
 
 class PlanFit:

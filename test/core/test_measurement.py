@@ -322,3 +322,26 @@ def test_a_voxel_that_few_views_know_is_object_only_on_top_of_object():
     grid = thresholded(volume, likelihood, views, CarvingParameters(threshold=0.03))
     assert grid.occupied[3:5, 3:6, 3:6].all()
     assert not grid.occupied[5].any()
+
+
+def hidden_by_cone(x, y, sonar):
+    """Where a truncated cone, 0.6 m wide, 0.3 m at its top and high, hides the seabed: a disc a layer."""
+    hidden = np.zeros(np.shape(x), bool)
+    for z in np.linspace(0.0, 0.3, 61):
+        share = (sonar[2] - z) / sonar[2]
+        at = (sonar[0] + (x - sonar[0]) * share, sonar[1] + (y - sonar[1]) * share)
+        hidden |= np.hypot(*at) < 0.3 - 0.5 * z
+    return hidden
+
+
+def test_a_side_that_is_drawn_in_upwards_is_followed_to_its_foot_that_the_echo_hides():
+    views = []
+    for view in perfect_views(hidden_by_cone, INFOS, "mask"):
+        pixels = view.pixels.copy()
+        rho = view.info.down_range_of_rows()
+        pixels[rho < 0.2] = MASK_UNKNOWN  # the cone's own echo, laid over its foot
+        views.append(View(view.info, pixels))
+    sides = [silhouette_sides(levels_of_mask(v), v, (0.0, 0.0)) for v in views]
+    support = np.concatenate([side.support_m for side in sides])
+    assert len(support) == 2 * len(INFOS)
+    assert np.median(support) == pytest.approx(0.3, abs=0.012)  # a pixel; the foot hides 2.4 cm
