@@ -160,21 +160,25 @@ class Flow:
         if not self._feeds(stream):
             return
         leaving = item.values.get("leaving") == "true"
-        peer = self.peers.get(item.instance)
-        if peer is None:
-            peer = self.peers[item.instance] = Peer(item.instance, item.node, role, stream, now, not leaving)
-            if not leaving:
-                self._arrived(peer)
-        elif not peer.alive and not leaving:
-            peer.alive = True
-            self._arrived(peer)
+        # A recorder of a stream that nobody publishes, as far as it knows: nothing for it to report.
+        idle = item.values.get("idle") == "true"
+        peer = self.peers.setdefault(item.instance, Peer(item.instance, item.node, role, stream, now, False))
+        there = not leaving and not idle
+        if idle and isinstance(item, ViewProgress):
+            there = peer.alive  # a kept report tells what was done, not how it stands now
         peer.heard_s = now
+        changed, peer.alive = peer.alive != there, there
+        if changed and there:
+            self._arrived(peer)
+        if leaving:
+            # Gone on purpose: nobody waits for it. An idle one may be a killed one's successor, which has
+            # not found the publishers yet: its predecessor is waited for as before.
+            self._gone.pop((peer.node, peer.stream), None)
+        if changed:
+            # At once: the next look may come after somebody was told that the run is over.
+            self._choose_leaves()
         if isinstance(item, ViewProgress):
             self._reported(peer, item)
-        if leaving:
-            # Gone on purpose: nobody waits for it.
-            peer.alive = False
-            self._gone.pop((peer.node, peer.stream), None)
 
     def _feeds(self, stream: str) -> bool:
         if self.stream == "sector" or stream == "sector":
@@ -285,14 +289,18 @@ class Flow:
         self._subscribers = subscribers
         if self._met_s is None and (subscribers or self.peers):
             self._met_s = now
+        if self.live() or subscribers:
+            self._served_s = now
+        self._choose_leaves()
+
+    def _choose_leaves(self) -> None:
+        """Say who are the last consumers, and what they lack."""
         live = self.live()
         takers = {place_of(p.stream) for p in live}
         # A stage is last if nobody behind it reports: it stands for the unknown that follows it.
         leaves = [p for p in live if p.role == "sink" or place_of(p.stream) + 1 not in takers]
         self._leaves = [p for p in leaves if p.role == "sink" or p.stream]
         keys = frozenset(p.key for p in self._leaves)
-        if live or subscribers:
-            self._served_s = now
         if keys != self._known_leaves:
             self._known_leaves = keys
             self._recount()
