@@ -86,24 +86,10 @@ def image_from_sectors(sectors: Iterable[Sector]) -> CoherentImage:
     GeometryError
         If there are none, or their grids or bands differ.
     """
-    first: Sector | None = None
-    total: NDArray[Any] = np.empty((0, 0))
-    stamps: set[int] = set()
+    # Late: the sum needs the FFT and the compiler, which readers of messages need not load.
+    from .streaming import SectorSum
+
+    total = SectorSum()
     for sector in sectors:
-        if sector.stamp_ns in stamps:
-            continue
-        stamps.add(sector.stamp_ns)
-        if first is None:
-            first = sector
-            total = np.array(sector.on_carrier())
-            continue
-        if not same_grid(first.grid, sector.grid) or sector.acoustics != first.acoustics:
-            what = "band" if same_grid(first.grid, sector.grid) else "grid"
-            raise GeometryError(
-                f"sector at {sector.stamp_ns} ns has another {what} than the first at {first.stamp_ns} ns:"
-                f" {getattr(sector, 'grid' if what == 'grid' else 'acoustics')}; expected one for all"
-            )
-        total += sector.on_carrier()
-    if first is None:
-        raise GeometryError("there are no sectors to sum; expected at least one")
-    return CoherentImage(total, first.grid, first.acoustics, max(stamps))
+        total.add(sector)
+    return total.image()
