@@ -623,6 +623,9 @@ def _node_plan(
         plan["sub_aperture"] |= flow
         flow = {"window": window, "min_sinks": 1}
     plan["bag_player"] = {"bag": str(Path(bag).resolve()), "stage": stage, "rate": float(rate), **flow}
+    if stage == "sector" and (rate == 0.0 or recording is not None):
+        # Flat out a provisional target is of no use to anybody; and a recording holds one view of a stamp.
+        plan["sub_aperture"]["first_search_deg"] = 360.0
     for name, own in overrides.items():
         if name not in NODES:
             raise errors.ParameterError(f"unknown node {name!r}; expected one of: {', '.join(NODES)}")

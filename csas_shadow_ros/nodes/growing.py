@@ -29,6 +29,8 @@ class Growing:
         self.period_s = 1.0 / hz
         #: Whether all views are in and the result is published.
         self.complete = False
+        #: Whether what is published is the end result, as far as anybody knows.
+        self.final = False
         self._dirty = False
         self._ended = False
         self._published_s = self._changed_s = -1e9
@@ -45,6 +47,7 @@ class Growing:
 
     def tick(self, now: float) -> None:
         """Publish if it is time to."""
+        self.final = self._ended
         if self._ended and not self.complete:
             # Also where nothing came at all: that is a result too.
             self._do(now)
@@ -52,6 +55,7 @@ class Growing:
         elif self._dirty:
             settled = now - self._source_s > _SOURCE_TIMEOUT_S and now - self._changed_s > IDLE_S
             due = now - self._published_s > max(self.period_s, 10.0 * self._cost_s)
+            self.final = settled
             if settled or (due and self._wanted()):
                 self._do(now)
 
