@@ -8,6 +8,8 @@ from collections.abc import Callable
 #: Without a source that tells the end, a result that has not changed for so long is shown as it is.
 IDLE_S = 2.0
 _SOURCE_TIMEOUT_S = 3.0
+#: After a burst of views that has been over for so long, publishing holds up nobody.
+_QUIET_S = 0.1
 
 
 class Growing:
@@ -20,7 +22,7 @@ class Growing:
     wanted : callable
         Says whether anybody looks.
     hz : float
-        Most often; less where publishing takes more than a tenth of the time.
+        Most often; while views are coming in less, where publishing takes more than a tenth of the time.
     """
 
     def __init__(self, publish: Callable[[], None], wanted: Callable[[], bool], hz: float) -> None:
@@ -54,7 +56,8 @@ class Growing:
             self.complete = True
         elif self._dirty:
             settled = now - self._source_s > _SOURCE_TIMEOUT_S and now - self._changed_s > IDLE_S
-            due = now - self._published_s > max(self.period_s, 10.0 * self._cost_s)
+            quiet = now - self._changed_s > _QUIET_S
+            due = now - self._published_s > max(self.period_s, 0.0 if quiet else 10.0 * self._cost_s)
             self.final = settled
             if settled or (due and self._wanted()):
                 self._do(now)
