@@ -685,6 +685,11 @@ class ViewOutlet:
         self._info = node.publisher(kind.info_topic, qos.VIEWS)
         self._image = node.publisher(kind.image_topic, qos.VIEWS)
 
+    @property
+    def wanted(self) -> bool:
+        """Whether anybody takes the stream: what nobody takes need not even be made."""
+        return bool(self._image.get_subscription_count() or self._info.get_subscription_count())
+
     def send(self, view: View) -> None:
         """Publish a view; its stamp goes out unchanged."""
         image, info = view_to_msgs(self._node.messages, view, self._stream)

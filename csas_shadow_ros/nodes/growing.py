@@ -9,7 +9,7 @@ from collections.abc import Callable
 IDLE_S = 2.0
 _SOURCE_TIMEOUT_S = 3.0
 #: After a burst of views that has been over for so long, publishing holds up nobody.
-_QUIET_S = 0.1
+_QUIET_S = 0.06
 
 
 class Growing:

@@ -54,7 +54,8 @@ class ShadowLikelihoodNode(CsasNode):
         target = self.target.target
         if self.mask is not None and target is not None:
             self.mask.send(segment_shadow(view, target.position_m, p, levels, reach_m=target.reach_m))
-        self.likelihood.send(outside_likelihood(view, p, levels))
+        if self.likelihood.wanted:
+            self.likelihood.send(outside_likelihood(view, p, levels))
         return PUBLISHED
 
 

@@ -45,6 +45,8 @@ class VoxelCarverNode(CsasNode):
         self.inlet = Inlet(self, self.stream, "sink", self.work, hold=self.target.missing)
         self.growing = Growing(self.publish_result, self.wanted, p.publish_hz)
         self.follow_sources()
+        # More often than a node's own tick: a sector's last view is to be shown at once.
+        self.every(0.05, self.show)
 
     def forget(self) -> None:
         """Drop the grid."""
@@ -98,8 +100,10 @@ class VoxelCarverNode(CsasNode):
         if beat.values.get("stream") != "sector":
             self.growing.source_says(self.inlet.instance in beat.values.get("finished_for", "").split())
 
-    def tick(self) -> None:
+    def show(self) -> None:
         """Publish what has changed."""
+        if not self.active:
+            return
         before = self.growing.complete
         self.growing.period_s = 1.0 / self.parameters.publish_hz
         self.growing.tick(time.monotonic())
