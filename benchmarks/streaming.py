@@ -189,7 +189,8 @@ def main() -> int:
         what = "late ≤ 0.5 s" if r["rate"] >= 4.0 else "p95 ≤ 0.5 s"
         print(
             f"| {r['rate']:g} × | {r['arc_deg']:g}° | {r['sectors']} | {r['median_s']:.2f} s |"
-            f" {r['p95_s']:.2f} s | {r['worst_s']:.2f} s | {r['last_lag_s']:.2f} s | {r['final_grid_after_s']:.2f} s | {what} |"
+            f" {r['p95_s']:.2f} s | {r['worst_s']:.2f} s | {r['last_lag_s']:.2f} s |"
+            f" {r['final_grid_after_s']:.2f} s | {what} |"
             f" {'yes' if r['met'] else 'NO'} |"
         )
     document = {
