@@ -79,10 +79,12 @@ class SubApertureNode(CsasNode):
 
     def waiting(self) -> str:
         """Say which input is missing."""
+        if self.stream is not None and (text := self.waiting_of_stream(self.stream)):
+            return text
         if self.sub_apertures is not None:
             return self.source.flow.waiting_for() and f"waiting for {self.source.flow.waiting_for()}"
         if self.stream is not None:
-            return self.waiting_of_stream(self.stream)
+            return ""
         missing = [n for n, x in (("image", self.image), ("track", self.track)) if x is None]
         return f"waiting for {' and '.join(missing)}" if missing else ""
 

@@ -7,6 +7,9 @@ import sys
 import time
 from typing import Any
 
+from numpy.typing import NDArray
+from rclpy.publisher import Publisher
+
 from csas_shadow_ros.core.arcs import Arc, Arcs
 from csas_shadow_ros.core.carving import Carver
 from csas_shadow_ros.core.errors import NoTargetError, ParameterError
@@ -114,28 +117,40 @@ class VoxelCarverNode(CsasNode):
 
     def wanted(self) -> bool:
         """Say whether anybody looks at unfinished results."""
-        return any(p.get_subscription_count() for p in (self.grid_image, self.voxels, self.mesh))
+        return looked_at(self.grid_image, self.voxels, self.mesh)
 
     def publish_result(self) -> None:
-        """Publish grid, voxels and mesh as they are."""
+        """Publish grid, voxels and mesh as they are; an unfinished one to those who look alone."""
         if self.carver is None:
             # Nothing came: no object as far as anybody knows.
             self.mesh.publish(mesh_to_msg(self.messages, None, self.now_ns()))
             return
         # Until all views are here the first look does: the second goes through all the silhouettes again.
-        grid = self.carver.grid() if self.growing.final else self.carver.first_look()
+        final = self.growing.final
+        grid = self.carver.grid() if final else self.carver.first_look()
         stamp = max(self.carver.stamps)
         self.object_voxels = int(grid.occupied.sum())
-        image, info = voxel_grid_to_msgs(self.messages, grid.volume, grid.likelihood, stamp)
-        self.grid_info.publish(info)
-        self.grid_image.publish(image)
-        image, info = voxel_grid_to_msgs(self.messages, grid.volume, grid.views, stamp, "voxel_views")
-        self.views_info.publish(info)
-        self.views_image.publish(image)
-        self.voxels.publish(voxels_to_msg(self.messages, grid, stamp))
+        pairs: dict[str, tuple[Publisher, Publisher, NDArray[Any]]] = {
+            "voxel_grid": (self.grid_info, self.grid_image, grid.likelihood),
+            "voxel_views": (self.views_info, self.views_image, grid.views),
+        }
+        for name, (info_publisher, image_publisher, values) in pairs.items():
+            if final or looked_at(info_publisher, image_publisher):
+                image, info = voxel_grid_to_msgs(self.messages, grid.volume, values, stamp, name)
+                info_publisher.publish(info)
+                image_publisher.publish(image)
+        if final or looked_at(self.voxels):
+            self.voxels.publish(voxels_to_msg(self.messages, grid, stamp))
         mesh = mesh_from_grid(grid) if grid.occupied.any() else None
         self.dimensions = measure(mesh) if mesh is not None else None
-        self.mesh.publish(mesh_to_msg(self.messages, mesh, stamp))
+        # A mesh of ten thousand triangles takes longer to write as a message than to carve from a view.
+        if final or looked_at(self.mesh):
+            self.mesh.publish(mesh_to_msg(self.messages, mesh, stamp))
+
+
+def looked_at(*publishers: Publisher) -> bool:
+    """Say whether anybody subscribes to one of the topics."""
+    return any(publisher.get_subscription_count() for publisher in publishers)
 
 
 def main() -> int:
