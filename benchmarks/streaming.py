@@ -158,7 +158,7 @@ def main() -> int:
         "--slow-arc-deg", type=float, default=120.0, help="arc played at rates under 4: a circle takes 5 min"
     )
     parser.add_argument("--target", choices=("given", "auto"), default="given")
-    parser.add_argument("--publish-hz", type=float, default=5.0)
+    parser.add_argument("--publish-hz", type=float, default=20.0)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     target = TargetParameters()
