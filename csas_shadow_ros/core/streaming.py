@@ -196,17 +196,12 @@ class SectorSum:
         turn = 0.0 if sector.acoustics.spectrum_sign > 0 else math.pi
         empty = np.empty((0, 0), np.complex64)
         half = arc.width_rad / 2.0
-        rows = scipy.fft.fft(
-            np.asarray(sector.on_carrier(), np.complex64),
-            values.shape[1],
-            1,
-            "forward",
-            workers=self._workers,
-        )
+        pixels = np.asarray(sector.on_carrier(), np.complex64)
         # The image's energy and its zero-padded transform's differ by the padding.
-        energy *= sector.pixels.size / values.size
+        energy *= pixels.size / values.size
         if arc.width_rad + 2.0 * half < math.pi:
             first, shape = self._box(arc.widened(half), turn)
+            rows = scipy.fft.fft(pixels, values.shape[1], 1, "forward", workers=self._workers)
             columns = rows[:, np.arange(first[1], first[1] + shape[1]) % values.shape[1]]
             spectrum = scipy.fft.fft(columns, values.shape[0], 0, "forward", True, workers=self._workers)
             box = spectrum[np.arange(first[0], first[0] + shape[0]) % values.shape[0]]
@@ -216,8 +211,7 @@ class SectorSum:
                 if _arc_of_box(box, first, steps, low, high, False, empty) >= (1.0 - beyond) * energy:
                     _arc_of_box(box, first, steps, low, high, False, values)
                     return margin
-        box = scipy.fft.fft(rows, values.shape[0], 0, "forward", True, workers=self._workers)
-        _arc_of_box(box, (0, 0), steps, 0.0, 0.0, True, values)
+        values += scipy.fft.fft2(pixels, values.shape, norm="forward", workers=self._workers)
         return math.pi
 
     def _box(self, arc: Arc, turn: float) -> tuple[tuple[int, int], tuple[int, int]]:
