@@ -47,14 +47,16 @@ class Sector:
                 f"sector has {self.pixels.shape} pixels; its grid says {self.grid.shape} (rows, cols)"
             )
 
+    def carrier(self) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+        """Return exp(j kx x) of the columns and exp(j ky y) of the rows: the carrier is their product."""
+        kx, ky = self.carrier_rad_m
+        along_x = np.exp(1j * kx * self.grid.x_of_columns()).astype(np.complex64)
+        along_y = np.exp(1j * ky * self.grid.y_of_rows()).astype(np.complex64)
+        return along_x, along_y
+
     def on_carrier(self) -> NDArray[Any]:
         """Return the true image, pixels · exp(j carrier · (x, y)), shape (rows, cols)."""
-        kx, ky = self.carrier_rad_m
-        if kx == 0.0 and ky == 0.0:
-            return self.pixels
-        dtype = self.pixels.dtype
-        along_x = np.exp(1j * kx * self.grid.x_of_columns()).astype(dtype)
-        along_y = np.exp(1j * ky * self.grid.y_of_rows()).astype(dtype)
+        along_x, along_y = self.carrier()
         product: NDArray[Any] = self.pixels * along_x[None, :] * along_y[:, None]
         return product
 

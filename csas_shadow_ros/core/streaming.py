@@ -75,6 +75,17 @@ def _arc_of_box(
     return energy
 
 
+def _cut(spectrum: NDArray[np.complex64], first: int, count: int, axis: int) -> NDArray[np.complex64]:
+    """Return `count` bins from signed bin `first` on, along one axis of a spectrum in FFT order."""
+    size, last = spectrum.shape[axis], first + count
+    if first < 0 < last:
+        parts = [slice(size + first, size), slice(0, last)]
+    else:
+        parts = [slice(first % size, first % size + count)]
+    found = [spectrum[part] if axis == 0 else spectrum[:, part] for part in parts]
+    return np.concatenate(found, axis) if len(found) > 1 else found[0]
+
+
 class SectorSum:
     """The full-circle spectrum, summed from sectors in any order as they come.
 
@@ -196,21 +207,24 @@ class SectorSum:
         turn = 0.0 if sector.acoustics.spectrum_sign > 0 else math.pi
         empty = np.empty((0, 0), np.complex64)
         half = arc.width_rad / 2.0
-        pixels = np.asarray(sector.on_carrier(), np.complex64)
         # The image's energy and its zero-padded transform's differ by the padding.
-        energy *= pixels.size / values.size
+        energy *= sector.pixels.size / values.size
         if arc.width_rad + 2.0 * half < math.pi:
             first, shape = self._box(arc.widened(half), turn)
-            rows = scipy.fft.fft(pixels, values.shape[1], 1, "forward", workers=self._workers)
-            columns = rows[:, np.arange(first[1], first[1] + shape[1]) % values.shape[1]]
+            along_x, along_y = sector.carrier()
+            rows = np.asarray(sector.pixels * along_x[None, :], np.complex64)
+            rows = scipy.fft.fft(rows, values.shape[1], 1, "forward", True, workers=self._workers)
+            # The carrier along the other axis need only be put on the columns that are kept.
+            columns = _cut(rows, first[1], shape[1], 1) * along_y[:, None]
             spectrum = scipy.fft.fft(columns, values.shape[0], 0, "forward", True, workers=self._workers)
-            box = spectrum[np.arange(first[0], first[0] + shape[0]) % values.shape[0]]
+            box = _cut(spectrum, first[0], shape[0], 0)
             for margin, beyond in ((_EDGE_RAD, _BEYOND_EDGE), (half, _BEYOND_HALF)):
                 low = arc.start_rad - margin + turn
                 high = low + arc.width_rad + 2.0 * margin
                 if _arc_of_box(box, first, steps, low, high, False, empty) >= (1.0 - beyond) * energy:
                     _arc_of_box(box, first, steps, low, high, False, values)
                     return margin
+        pixels = np.asarray(sector.on_carrier(), np.complex64)
         values += scipy.fft.fft2(pixels, values.shape, norm="forward", workers=self._workers)
         return math.pi
 

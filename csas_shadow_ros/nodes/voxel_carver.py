@@ -49,7 +49,7 @@ class VoxelCarverNode(CsasNode):
         self.growing = Growing(self.publish_result, self.wanted, p.publish_hz)
         self.follow_sources()
         # More often than a node's own tick: a sector's last view is to be shown at once.
-        self.every(0.05, self.show)
+        self.every(0.02, self.show)
 
     def forget(self) -> None:
         """Drop the grid."""
