@@ -258,6 +258,13 @@ def _add_simulate(add: Callable[..., argparse.ArgumentParser]) -> None:
         help="pixels of the image: float32, float64, int16 or int8 pairs (default 32FC2)",
     )
     p.add_argument(
+        "--sectors",
+        type=float,
+        default=0.0,
+        metavar="DEG",
+        help="write sectors of so much arc, as they come during a run, instead of the image",
+    )
+    p.add_argument(
         "--spectrum-sign",
         type=int,
         choices=(1, -1),
@@ -465,6 +472,7 @@ def _simulate(arguments: argparse.Namespace, console: Console) -> int:
             progress=bar,
             encoding=arguments.encoding,
             overwrite=arguments.overwrite,
+            sectors_deg=arguments.sectors,
         )
     out = Path(arguments.out_bag)
     length, width, height = run.truth.dims_m

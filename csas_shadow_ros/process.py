@@ -251,6 +251,7 @@ def _from_image(
             on_view=writer.add_view,
             workers=workers,
             max_objects=max_objects,
+            spectrum=None if run.image is not None else run.sector_sum().spectrum,
         )
     except SpectrumSignError as error:
         raise SpectrumSignError(

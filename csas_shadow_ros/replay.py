@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
@@ -37,6 +37,7 @@ from .core.target import Target
 from .core.threshold import thresholded
 from .core.volume import VoxelGrid
 from .nodes.params import NODES, check, yaml_text
+from .nodes.playing import recorded_streams, stage_of_bag
 
 PACKAGE = "csas_shadow_ros"
 #: Stages of a bag, and the nodes that turn each into the next.
@@ -333,6 +334,7 @@ class Graph:
             name: GraphProcess(name, self.environment, log_dir, file if name in has_own else None)
             for name in parameters
         }
+        self.parameters = parameters
         self.max_restarts = max_restarts
         #: One line for each process that died.
         self.deaths: list[str] = []
@@ -404,6 +406,7 @@ class _Watcher:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self.beats: dict[tuple[str, str], Any] = {}
+        self._dead: set[str] = set()
         self.rejected: dict[tuple[int, str], RejectedView] = {}
         self.errors: dict[str, str] = {}
         self.latest: dict[str, Any] = {}
@@ -423,7 +426,7 @@ class _Watcher:
         except CsasError:
             return  # an outside node's; the graph's own are well-formed
         if isinstance(item, Heartbeat):
-            if item.values.get("leaving") != "true":
+            if item.values.get("leaving") != "true" and item.instance not in self._dead:
                 stream = item.values.get("stream", item.values.get("input", ""))
                 self.beats[item.node, stream] = item
             if text := item.values.get("error"):
@@ -432,6 +435,25 @@ class _Watcher:
             aspect = float(item.values.get("aspect_deg", "nan"))
             view = RejectedView(item.node, item.stamp_ns, aspect, item.reason)
             self.rejected.setdefault((item.stamp_ns, item.values.get("aspect_deg", "")), view)
+
+    def died(self, node: str) -> None:
+        """Forget what a process said of itself that is no more."""
+        for key in [key for key in self.beats if key[0] == node]:
+            self._dead.add(self.beats.pop(key).instance)
+
+    def recorded(self, streams: Iterable[str]) -> bool:
+        """Say whether the running recorder has every view of those of the streams that somebody publishes."""
+        from msg_adapters.topics import stream as stream_of
+
+        finished: set[str] = set()
+        for beat in self.beats.values():
+            finished.update(beat.values.get("finished_for", "").split())
+        for stream in streams:
+            if self._node.count_publishers(stream_of(stream).image_topic):
+                beat = self.beats.get(("bag_recorder", stream))
+                if beat is None or beat.instance not in finished:
+                    return False
+        return True
 
     def spin(self, seconds: float) -> None:
         end = time.monotonic() + seconds
@@ -565,7 +587,6 @@ def replay(
 def _plan(bag: str | Path, stage: str, p: PipelineParameters) -> tuple[str, Target | None]:
     """Say what is played, and where the target is if no node can find it."""
     from .bags import BagReader
-    from .nodes.playing import stage_of_bag
 
     reader = BagReader(bag)
     chosen = stage_of_bag(reader, stage)
@@ -606,6 +627,9 @@ def _node_plan(
         plan["sub_aperture"] |= flow
         flow = {"window": window, "min_sinks": 1}
     plan["bag_player"] = {"bag": str(Path(bag).resolve()), "stage": stage, "rate": float(rate), **flow}
+    if stage == "sector" and (rate == 0.0 or recording is not None):
+        # Flat out a provisional target is of no use to anybody; and a recording holds one view of a stamp.
+        plan["sub_aperture"]["first_search_deg"] = 360.0
     for name, own in overrides.items():
         if name not in NODES:
             raise errors.ParameterError(f"unknown node {name!r}; expected one of: {', '.join(NODES)}")
@@ -650,6 +674,7 @@ def _until_complete(
         watcher.spin(0.1)
         graph.watch()
         for line in graph.deaths[told:]:
+            watcher.died(line.partition(" ")[0])
             tell(f"{line}; it is started again")
         told = len(graph.deaths)
         for name, text in watcher.errors.items():
@@ -678,7 +703,9 @@ def _sinks_complete(graph: Graph, watcher: _Watcher) -> bool:
         beats = [b for (node, _), b in watcher.beats.items() if node == name]
         if not beats or not all(b.counts.get("complete") for b in beats):
             return False
-    return True
+    if "bag_recorder" not in graph.processes:
+        return True
+    return watcher.recorded(recorded_streams(graph.parameters["bag_recorder"].get("topics", "all")))
 
 
 def _error_of(node: str, text: str) -> CsasError:

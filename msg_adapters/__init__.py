@@ -44,7 +44,7 @@ from .pairs import (
     voxel_grid_to_msgs,
 )
 from .progress import Heartbeat, Level, ViewProgress, diagnostics_to_msg, progress_from_msg, progress_to_msg
-from .target import TargetBox, target_from_msg, target_to_msg
+from .target import TargetBox, target_from_msg, target_may_move, target_to_msg
 from .topics import NAMESPACE, STREAMS, TOPICS, VIEW_STREAMS, ImageStream, Topic, absolute_name
 from .track import track_from_msg, track_to_msg
 from .voxels import Voxels, voxels_from_msg, voxels_to_msg
@@ -94,6 +94,7 @@ __all__ = [
     "stamp_from_ns",
     "stamp_to_ns",
     "target_from_msg",
+    "target_may_move",
     "target_to_msg",
     "track_from_msg",
     "track_to_msg",

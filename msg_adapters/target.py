@@ -14,6 +14,8 @@ from .messages import MessageFactory, point, xyz_of
 CUBE = 1
 MARKER_NAMESPACE = "csas_target"
 COLOUR = (0.2, 0.6, 1.0, 0.15)
+#: Text of the marker of a run that is still going on: another one may follow, and replaces it.
+MAY_MOVE = "may move"
 
 
 @dataclass(frozen=True)
@@ -37,16 +39,30 @@ class TargetBox:
         return cls(volume.centre_m, volume.size_m)
 
 
-def target_to_msg(factory: MessageFactory, box: TargetBox | None, stamp_ns: int) -> Any:
+def target_to_msg(
+    factory: MessageFactory, box: TargetBox | None, stamp_ns: int, *, may_move: bool = False
+) -> Any:
     """Make the Marker of the carved box; None says that there is no object.
+
+    Parameters
+    ----------
+    factory : MessageFactory
+        Makes the message.
+    box : TargetBox or None
+        The box.
+    stamp_ns : int
+        Stamp; of a target that moves a later one each time.
+    may_move : bool
+        The run is still going on: another target may follow, and replaces this one.
 
     Raises
     ------
     AdapterError
         If the box has no size.
     """
+    text = MAY_MOVE if may_move else ""
     if box is None:
-        return marker(factory, stamp_ns, MARKER_NAMESPACE, CUBE, DELETE)
+        return marker(factory, stamp_ns, MARKER_NAMESPACE, CUBE, DELETE, text=text)
     if not min(box.size_m) > 0:
         raise AdapterError(f"target size is {box.size_m}; expected x, y, z > 0 m")
     return marker(
@@ -58,7 +74,13 @@ def target_to_msg(factory: MessageFactory, box: TargetBox | None, stamp_ns: int)
         pose=pose(factory, box.centre_m),
         scale=point(factory, box.size_m, "geometry_msgs/msg/Vector3"),
         color=colour(factory, COLOUR),
+        text=text,
     )
+
+
+def target_may_move(msg: Any) -> bool:
+    """Say whether a target's marker is of a run that is still going on."""
+    return str(getattr(msg, "text", "")) == MAY_MOVE
 
 
 def target_from_msg(msg: Any) -> TargetBox | None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from csas_shadow_ros.core.errors import BagError, CsasError
 from csas_shadow_ros.core.geometry import CoherentImage, Track, View
-from csas_shadow_ros.core.sector import Sector, image_from_sectors
+from csas_shadow_ros.core.sector import Sector
 from msg_adapters.image import largest_part, quantise
 from msg_adapters.messages import RosbagsMessages, stamp_to_ns
 from msg_adapters.pairs import (
@@ -32,6 +32,9 @@ from msg_adapters.topics import (
 from msg_adapters.track import track_from_msg, track_to_msg
 
 from .bag import BagMessage, BagReader, BagWriter
+
+if TYPE_CHECKING:
+    from csas_shadow_ros.core.streaming import SectorSum
 
 T = TypeVar("T")
 
@@ -96,6 +99,7 @@ class Run:
     counts: dict[str, int]
     problems: list[Problem] = field(default_factory=list)
     _reader: BagReader | None = None
+    _sum: SectorSum | None = None
 
     def views(self, stream_name: str) -> Iterator[View]:
         """Iterate the views of a stage: `sub_aperture`, `shadow`, `likelihood` or `shadow_mask`.
@@ -113,6 +117,30 @@ class Run:
         """Iterate the sectors."""
         return self._each("sector", sector_from_msgs)
 
+    def sector_sum(self) -> SectorSum:
+        """Return the sum of the sectors; it is made once.
+
+        Raises
+        ------
+        BagError
+            If there are none that can be summed.
+        """
+        # Late: it needs the FFT and the compiler, which a player of bags need not load.
+        from csas_shadow_ros.core.streaming import SectorSum
+
+        if self._sum is None:
+            total = SectorSum()
+            topic = absolute_name(stream("sector").image_topic, self.namespace)
+            for sector in self.sectors():
+                try:
+                    total.add(sector)
+                except CsasError as error:
+                    self.problems.append(Problem(topic, None, sector.stamp_ns, str(error)))
+            if not total.stamps:
+                raise BagError(self.why("no image can be summed from the sectors"))
+            self._sum = total
+        return self._sum
+
     def coherent_image(self) -> CoherentImage:
         """Return the full-circle image; summed from the sectors if the bag has those instead.
 
@@ -124,10 +152,7 @@ class Run:
         if self.image is not None:
             return self.image
         if self.counts.get("sector"):
-            try:
-                return image_from_sectors(self.sectors())
-            except CsasError as error:
-                raise BagError(self.why(f"no image can be summed from the sectors ({error})")) from error
+            return self.sector_sum().image()
         raise BagError(self.why("there is no full-circle image"))
 
     def require_track(self) -> Track:
@@ -313,6 +338,7 @@ def write_run(
     overwrite: bool = False,
     namespace: str = NAMESPACE,
     sectors: Iterable[Sector] = (),
+    sector_times_ns: Mapping[int, int] | None = None,
     extra: Iterable[tuple[str, Any]] = (),
 ) -> Path:
     """Write a run as a rosbag2 directory that any ROS 2 tool opens.
@@ -336,6 +362,8 @@ def write_run(
         Namespace of the topics.
     sectors : iterable of Sector
         Sectors, instead of the image or besides it.
+    sector_times_ns : mapping of int to int, optional
+        When each sector was made, by its stamp; its stamp otherwise. A player keeps to it.
     extra : iterable of (str, message)
         More stamped messages (rclpy or rosbags), by relative or absolute topic.
 
@@ -373,8 +401,9 @@ def write_run(
             sectors = [replace(s, pixels=quantise(s.pixels, encoding, peak)) for s in sectors]
         for sector in sectors:
             a, b = sector_to_msgs(factory, sector, encoding)
-            writer.write(name("sector/camera_info"), b)
-            writer.write(name("sector/image"), a)
+            made = (sector_times_ns or {}).get(sector.stamp_ns)
+            writer.write(name("sector/camera_info"), b, made)
+            writer.write(name("sector/image"), a, made)
         if image is not None:
             if integers:
                 image = replace(image, pixels=quantise(image.pixels, encoding))

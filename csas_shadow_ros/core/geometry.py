@@ -725,6 +725,12 @@ def aspects_of_step(step_rad: float, start_rad: float = 0.0) -> FloatArray:
     return start_rad + np.arange(n, dtype=np.float64) * (TWO_PI / n)
 
 
+def looks_at(info: ViewInfo, target_m: tuple[float, float]) -> bool:
+    """Say whether a view's focus range is that of a target, r₀ = e_r · target; without one it may be."""
+    r0 = float(down_range_axis(info.aspect_rad) @ np.asarray(target_m, dtype=np.float64))
+    return not math.isfinite(info.focus_range_m) or abs(info.focus_range_m - r0) < 1e-6
+
+
 def fit_target_to_focus(infos: Sequence[ViewInfo]) -> tuple[float, float]:
     """Find the ground point whose down-range in every view is that view's focus range.
 

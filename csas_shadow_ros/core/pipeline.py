@@ -145,6 +145,7 @@ def run(
     on_view: Callable[[ProcessedView], None] | None = None,
     workers: int = 2,
     max_objects: int = MAX_OBJECTS,
+    spectrum: Spectrum | None = None,
 ) -> Result:
     """Reconstruct the target of a circular run, and what else stands there, from their shadows.
 
@@ -165,6 +166,8 @@ def run(
     max_objects : int
         At most so many bodies of the search are carved, the target among them; nothing of the target's
         result depends on it. A target whose position is given is the only one.
+    spectrum : Spectrum, optional
+        The image's spectrum, if it was made before: of a run that came as sectors it is what was summed.
 
     Returns
     -------
@@ -187,7 +190,7 @@ def run(
     def lap(step: str) -> None:
         result.timings_s[step] = time.perf_counter() - start - sum(result.timings_s.values())
 
-    spectrum = Spectrum.of_image(image, workers)
+    spectrum = spectrum or Spectrum.of_image(image, workers)
     lap("spectrum")
     if p.sub_aperture.check_sign:
         result.sign, search = spectrum_sign_evidence(image, track, spectrum=spectrum)

@@ -47,14 +47,16 @@ class Sector:
                 f"sector has {self.pixels.shape} pixels; its grid says {self.grid.shape} (rows, cols)"
             )
 
+    def carrier(self) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+        """Return exp(j kx x) of the columns and exp(j ky y) of the rows: the carrier is their product."""
+        kx, ky = self.carrier_rad_m
+        along_x = np.exp(1j * kx * self.grid.x_of_columns()).astype(np.complex64)
+        along_y = np.exp(1j * ky * self.grid.y_of_rows()).astype(np.complex64)
+        return along_x, along_y
+
     def on_carrier(self) -> NDArray[Any]:
         """Return the true image, pixels · exp(j carrier · (x, y)), shape (rows, cols)."""
-        kx, ky = self.carrier_rad_m
-        if kx == 0.0 and ky == 0.0:
-            return self.pixels
-        dtype = self.pixels.dtype
-        along_x = np.exp(1j * kx * self.grid.x_of_columns()).astype(dtype)
-        along_y = np.exp(1j * ky * self.grid.y_of_rows()).astype(dtype)
+        along_x, along_y = self.carrier()
         product: NDArray[Any] = self.pixels * along_x[None, :] * along_y[:, None]
         return product
 
@@ -86,24 +88,10 @@ def image_from_sectors(sectors: Iterable[Sector]) -> CoherentImage:
     GeometryError
         If there are none, or their grids or bands differ.
     """
-    first: Sector | None = None
-    total: NDArray[Any] = np.empty((0, 0))
-    stamps: set[int] = set()
+    # Late: the sum needs the FFT and the compiler, which readers of messages need not load.
+    from .streaming import SectorSum
+
+    total = SectorSum()
     for sector in sectors:
-        if sector.stamp_ns in stamps:
-            continue
-        stamps.add(sector.stamp_ns)
-        if first is None:
-            first = sector
-            total = np.array(sector.on_carrier())
-            continue
-        if not same_grid(first.grid, sector.grid) or sector.acoustics != first.acoustics:
-            what = "band" if same_grid(first.grid, sector.grid) else "grid"
-            raise GeometryError(
-                f"sector at {sector.stamp_ns} ns has another {what} than the first at {first.stamp_ns} ns:"
-                f" {getattr(sector, 'grid' if what == 'grid' else 'acoustics')}; expected one for all"
-            )
-        total += sector.on_carrier()
-    if first is None:
-        raise GeometryError("there are no sectors to sum; expected at least one")
-    return CoherentImage(total, first.grid, first.acoustics, max(stamps))
+        total.add(sector)
+    return total.image()

@@ -6,20 +6,19 @@ import fcntl
 import sys
 import time
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
 from csas_shadow_ros.bags import BagReader, BagWriter
 from csas_shadow_ros.core.errors import BagError, ParameterError
-from msg_adapters import STREAMS, TOPICS, VIEW_STREAMS, Heartbeat
+from msg_adapters import STREAMS, TOPICS, Heartbeat
 from msg_adapters.topics import absolute_name
 
 from . import qos
 from .base import INTEGRATED, CsasNode, Inlet, run_node
-from .playing import header_stamp
+from .playing import header_stamp, recorded_streams, topics_to_record
 
-#: Streams whose pairs take part in flow control.
-_FLOWING = (*VIEW_STREAMS, "sector")
 #: Latched when they were published, and so when they are played.
 _LATCHED = frozenset(
     {"image", "camera_info", "track", "target", "voxels", "mesh"}
@@ -51,13 +50,23 @@ class RecordingInlet(Inlet):
         if stamp in self.stamps[not is_info]:
             self.report(stamp, INTEGRATED)
 
+    def report_taken_over(self) -> None:
+        """Report what is in the bag already."""
+        for stamp in sorted(self.stamps[False] & self.stamps[True]):
+            self.report(stamp, INTEGRATED, **self._idle())
+
+    def _idle(self) -> dict[str, str]:
+        # Right after the start this also means: not discovered yet.
+        published = self.node.count_publishers(STREAMS[self.stream].image_topic)
+        return {} if published else {"idle": "true"}
+
     def give_up_lonely(self) -> None:
         """Nothing is kept that could be lonely."""
 
     def beat(self, *, leaving: bool) -> Heartbeat:
         """Make the heartbeat; a stream that nobody publishes is waited for by nobody."""
-        nobody = not self.node.count_publishers(STREAMS[self.stream].image_topic)
-        return super().beat(leaving=leaving or nobody)
+        beat = super().beat(leaving=leaving)
+        return replace(beat, values={**beat.values, **self._idle()})
 
 
 class BagRecorderNode(CsasNode):
@@ -72,13 +81,9 @@ class BagRecorderNode(CsasNode):
         p = self.parameters
         if not p.out:
             raise ParameterError("out is ''; expected the path of the bag to make")
-        names = list(TOPICS) if p.topics == "all" else [t.strip() for t in p.topics.split(",") if t.strip()]
-        if unknown := [n for n in names if n not in TOPICS]:
-            raise ParameterError(f"topics names {unknown[0]!r}; expected some of: {', '.join(TOPICS)}")
         self._flows = {
             topic: (inlet, is_info)
-            for stream in _FLOWING
-            if {STREAMS[stream].image_topic, STREAMS[stream].info_topic} <= set(names)
+            for stream in recorded_streams(p.topics)
             for inlet in [RecordingInlet(self, stream)]
             for topic, is_info in ((STREAMS[stream].image_topic, False), (STREAMS[stream].info_topic, True))
         }
@@ -86,7 +91,7 @@ class BagRecorderNode(CsasNode):
         self._flushed_s = 0.0
         self._open(Path(p.out))
         self.inlets.extend(dict.fromkeys(inlet for inlet, _ in self._flows.values()))
-        for topic in names:
+        for topic in topics_to_record(p.topics):
             self._record(topic)
 
     def _open(self, out: Path) -> None:
@@ -171,8 +176,7 @@ class BagRecorderNode(CsasNode):
             self.error = f"{self.parameters.out} is finished; clean up and configure again for another bag"
         for inlet in self.inlets:
             if isinstance(inlet, RecordingInlet):
-                for stamp in sorted(inlet.stamps[False] & inlet.stamps[True]):
-                    inlet.report(stamp, INTEGRATED)
+                inlet.report_taken_over()
 
     def tick(self) -> None:
         """See to it that a crash costs little."""

@@ -41,6 +41,7 @@ from msg_adapters import (
     progress_to_msg,
     stamp_to_ns,
     target_from_msg,
+    target_may_move,
     view_info_from_msg,
     view_to_msgs,
 )
@@ -119,6 +120,8 @@ class CsasNode(LifecycleNode):
         self.busy_s = 0.0
         #: What stops the node from working, if anything does; shown in diagnostics and heartbeats.
         self.error = ""
+        #: Stamp of the target that the node works for, "0" before there is one; empty: it needs none.
+        self.target_stamp = ""
         self.inlets: list[Inlet] = []
         self.sources: list[Source] = []
         self._owned: list[tuple[Callable[[Any], Any], Any]] = []
@@ -147,6 +150,10 @@ class CsasNode(LifecycleNode):
 
     def state_counts(self) -> dict[str, int]:
         """Return counts for the heartbeat, besides the common ones."""
+        return {}
+
+    def state_values(self) -> dict[str, str]:
+        """Return what else is worth telling in the heartbeat and in diagnostics."""
         return {}
 
     def waiting(self) -> str:
@@ -294,7 +301,7 @@ class CsasNode(LifecycleNode):
                 values[f"{name} per second"] = f"{(count - before) / (now - since):.1f}"
         values |= {f"rejected: {self.examples[kind]}": str(n) for kind, n in self.reasons.most_common()}
         values["busy seconds"] = f"{self.busy_s:.3f}"
-        values |= {k: str(v) for k, v in self.state_counts().items()}
+        values |= {k: str(v) for k, v in self.state_counts().items()} | self.state_values()
         for source in self.sources:
             values |= {f"{source.stream} {k}": str(v) for k, v in source.counts().items()}
         waiting = self.waiting()
@@ -501,7 +508,7 @@ class Inlet:
         """Tell the sources what became of a view."""
         self.node.counts["out" if outcome == PUBLISHED else outcome] += outcome != REJECTED
         level = Level.WARN if outcome == REJECTED else Level.OK
-        values = {"role": self.role, "input": self.stream, **more}
+        values = {"role": self.role, "input": self.stream, **self._for_target(), **more}
         self.node.send_report(
             ViewProgress(stamp_ns, self.node.name, self.instance, outcome, reason, level, values)
         )
@@ -518,9 +525,12 @@ class Inlet:
             self._pairer.flush()
             self._report_orphans()
 
+    def _for_target(self) -> dict[str, str]:
+        return {"target": self.node.target_stamp} if self.node.target_stamp else {}
+
     def beat(self, *, leaving: bool) -> Heartbeat:
         """Make the heartbeat."""
-        values = {"input": self.stream}
+        values = {"input": self.stream, **self._for_target(), **self.node.state_values()}
         if leaving:
             values["leaving"] = "true"
         if self.node.error:
@@ -650,6 +660,7 @@ class Source:
         else:
             values["finished_for"] = " ".join(self.flow.finished_for())
             values["waiting_for"] = self.flow.waiting_for()
+            values |= self.node.state_values()
         if self.node.error:
             values["error"] = self.node.error
         counts = self.node.common_counts() | self.counts()
@@ -674,6 +685,11 @@ class ViewOutlet:
         self._info = node.publisher(kind.info_topic, qos.VIEWS)
         self._image = node.publisher(kind.image_topic, qos.VIEWS)
 
+    @property
+    def wanted(self) -> bool:
+        """Whether anybody takes the stream: what nobody takes need not even be made."""
+        return bool(self._image.get_subscription_count() or self._info.get_subscription_count())
+
     def send(self, view: View) -> None:
         """Publish a view; its stamp goes out unchanged."""
         image, info = view_to_msgs(self._node.messages, view, self._stream)
@@ -689,13 +705,21 @@ class TargetInlet:
     node : CsasNode
         The node; its parameters say whether the target is given.
     on_known : callable
-        Called once it is known that there is a target, or that there is none.
+        Called once it is known that there is a target, or that there is none; again when it has moved.
+    on_moved : callable, optional
+        Called before that when the target of a run that is still going on has moved: what was made of views
+        until then is of no use any more.
     """
 
-    def __init__(self, node: CsasNode, on_known: Callable[[], None]) -> None:
+    def __init__(
+        self, node: CsasNode, on_known: Callable[[], None], on_moved: Callable[[], None] | None = None
+    ) -> None:
         p = node.parameters
         self._node = node
         self._on_known = on_known
+        self._on_moved = on_moved or (lambda: None)
+        #: Whether another target may follow and replace this one.
+        self.may_move = False
         self.known = p.target == "given"
         self.target: Target | None = None
         if self.known:
@@ -705,13 +729,18 @@ class TargetInlet:
             size = getattr(p, "size_m", (0.0, 0.0, 0.0))
             self.target = Target((p.position_m[0], p.position_m[1]), (size[0], size[1], size[2]))
         else:
+            node.target_stamp = "0"
             node.subscribe_latched("target", self._take)
 
     def _take(self, msg: Any) -> None:
         box = target_from_msg(msg)
         target = self._target_of(box)
-        if not self.known:
-            self.known, self.target = True, target
+        stamp = str(stamp_to_ns(msg.header.stamp, "target.header.stamp"))
+        if not self.known or (self.may_move and target_may_move(msg) and stamp != self._node.target_stamp):
+            moved, self.known, self.target = self.known, True, target
+            self.may_move, self._node.target_stamp = target_may_move(msg), stamp
+            if moved:
+                self._on_moved()
             self._on_known()
         elif self._place(target) != self._place(self.target):
             self._node.reject(

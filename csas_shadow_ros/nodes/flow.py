@@ -50,6 +50,8 @@ class Peer:
     stream: str
     heard_s: float
     alive: bool = True
+    #: The target that it works for; empty if it needs none.
+    target: str = ""
 
     @property
     def key(self) -> str:
@@ -115,6 +117,12 @@ class Flow:
 
     def __post_init__(self) -> None:
         check_range("window", self.window, 1, 64)
+        #: More views will be offered: the run is not over when all are done.
+        self.more_to_come = False
+        #: No view is sent for the first time.
+        self.held = False
+        #: The target that views are made for; reports of views of another one do not count. Empty: any.
+        self.target = ""
         self.peers: dict[str, Peer] = {}
         self.lost: dict[int, str] = {}
         self.resends = 0
@@ -148,6 +156,15 @@ class Flow:
         self._in_flight.pop(stamp, None)
         self._missing.pop(stamp, None)
 
+    def begin_again(self, target: str) -> None:
+        """Forget all views and what was reported of them: they are offered again, for another target."""
+        self.target = target
+        self.lost.clear()
+        for kept in (self._stamps, self._refused, self._reports, self._rejected_at, self._in_flight):
+            kept.clear()
+        self._missing.clear()
+        self._progress_s = self.clock()
+
     # What consumers say
 
     def heard(self, item: ViewProgress | Heartbeat) -> None:
@@ -160,21 +177,29 @@ class Flow:
         if not self._feeds(stream):
             return
         leaving = item.values.get("leaving") == "true"
-        peer = self.peers.get(item.instance)
-        if peer is None:
-            peer = self.peers[item.instance] = Peer(item.instance, item.node, role, stream, now, not leaving)
-            if not leaving:
-                self._arrived(peer)
-        elif not peer.alive and not leaving:
-            peer.alive = True
-            self._arrived(peer)
+        # A recorder of a stream that nobody publishes, as far as it knows: nothing for it to report.
+        idle = item.values.get("idle") == "true"
+        peer = self.peers.setdefault(item.instance, Peer(item.instance, item.node, role, stream, now, False))
+        there = not leaving and not idle
+        if idle and isinstance(item, ViewProgress):
+            there = peer.alive  # a kept report tells what was done, not how it stands now
         peer.heard_s = now
-        if isinstance(item, ViewProgress):
-            self._reported(peer, item)
+        peer.target = item.values.get("target", "")
+        changed, peer.alive = peer.alive != there, there
+        if changed and there:
+            self._arrived(peer)
         if leaving:
-            # Gone on purpose: nobody waits for it.
-            peer.alive = False
+            # Gone on purpose: nobody waits for it. An idle one may be a killed one's successor, which has
+            # not found the publishers yet: its predecessor is waited for as before.
             self._gone.pop((peer.node, peer.stream), None)
+        if changed:
+            # At once: the next look may come after somebody was told that the run is over.
+            self._choose_leaves()
+        if isinstance(item, ViewProgress) and self._counts(peer):
+            self._reported(peer, item)
+
+    def _counts(self, peer: Peer) -> bool:
+        return not (self.target and peer.target) or peer.target == self.target
 
     def _feeds(self, stream: str) -> bool:
         if self.stream == "sector" or stream == "sector":
@@ -285,14 +310,18 @@ class Flow:
         self._subscribers = subscribers
         if self._met_s is None and (subscribers or self.peers):
             self._met_s = now
+        if self.live() or subscribers:
+            self._served_s = now
+        self._choose_leaves()
+
+    def _choose_leaves(self) -> None:
+        """Say who are the last consumers, and what they lack."""
         live = self.live()
         takers = {place_of(p.stream) for p in live}
         # A stage is last if nobody behind it reports: it stands for the unknown that follows it.
         leaves = [p for p in live if p.role == "sink" or place_of(p.stream) + 1 not in takers]
         self._leaves = [p for p in leaves if p.role == "sink" or p.stream]
         keys = frozenset(p.key for p in self._leaves)
-        if live or subscribers:
-            self._served_s = now
         if keys != self._known_leaves:
             self._known_leaves = keys
             self._recount()
@@ -313,6 +342,8 @@ class Flow:
         now = self.clock()
         if self._met_s is not None and now - self._met_s < self.settle_s:
             return "whoever else is there to be heard"
+        if others := sorted({p.node for p in self.live() if not self._counts(p)}):
+            return f"{', '.join(others)} to take the target"
         if self._gone and not self.sinks():
             return f"{', '.join(sorted(n for n, _ in self._gone))} to come back"
         if now - self._born_s < self.sink_wait_s and len(self.sinks()) < self.min_sinks:
@@ -347,7 +378,7 @@ class Flow:
             sent.attempts += 1
             sent.at_s, sent.serial, sent.overtaken, sent.due = now, self._serial, 0, False
             return stamp
-        if not fresh or len(self._in_flight) >= self.window:
+        if not fresh or self.held or len(self._in_flight) >= self.window:
             return None
         for stamp in self._missing:
             if stamp not in self._in_flight and stamp not in self.lost:
@@ -397,7 +428,7 @@ class Flow:
     @property
     def finished(self) -> bool:
         """Whether there is nothing left to do for anybody who is there or waited for."""
-        if not self._stamps or self._gone or self._in_flight:
+        if not self._stamps or self.more_to_come or self._gone or self._in_flight:
             return False
         if self.waiting_for():
             return False

@@ -8,6 +8,8 @@ from collections.abc import Callable
 #: Without a source that tells the end, a result that has not changed for so long is shown as it is.
 IDLE_S = 2.0
 _SOURCE_TIMEOUT_S = 3.0
+#: After a burst of views that has been over for so long, publishing holds up nobody.
+_QUIET_S = 0.06
 
 
 class Growing:
@@ -20,7 +22,7 @@ class Growing:
     wanted : callable
         Says whether anybody looks.
     hz : float
-        Most often; less where publishing takes more than a tenth of the time.
+        Most often; while views are coming in less, where publishing takes more than a tenth of the time.
     """
 
     def __init__(self, publish: Callable[[], None], wanted: Callable[[], bool], hz: float) -> None:
@@ -29,6 +31,8 @@ class Growing:
         self.period_s = 1.0 / hz
         #: Whether all views are in and the result is published.
         self.complete = False
+        #: Whether what is published is the end result, as far as anybody knows.
+        self.final = False
         self._dirty = False
         self._ended = False
         self._published_s = self._changed_s = -1e9
@@ -45,13 +49,16 @@ class Growing:
 
     def tick(self, now: float) -> None:
         """Publish if it is time to."""
+        self.final = self._ended
         if self._ended and not self.complete:
             # Also where nothing came at all: that is a result too.
             self._do(now)
             self.complete = True
         elif self._dirty:
             settled = now - self._source_s > _SOURCE_TIMEOUT_S and now - self._changed_s > IDLE_S
-            due = now - self._published_s > max(self.period_s, 10.0 * self._cost_s)
+            quiet = now - self._changed_s > _QUIET_S
+            due = now - self._published_s > max(self.period_s, 0.0 if quiet else 10.0 * self._cost_s)
+            self.final = settled
             if settled or (due and self._wanted()):
                 self._do(now)
 

@@ -86,6 +86,14 @@ class BoxParameters(Parameters):
 class SubApertureNodeParameters(NodeParameters, FlowParameters, TargetParameters, SubApertureParameters):
     """Parameters of `sub_aperture`."""
 
+    first_search_deg: float = bounded(
+        120.0,
+        "sectors: a target is looked for once they cover so much; 360: not before the circle is closed",
+        low=30.0,
+        high=360.0,
+        unit="deg",
+    )
+
 
 @dataclass(frozen=True)
 class ShadowEnhancementNodeParameters(NodeParameters, FocusParameters, ShadowParameters):

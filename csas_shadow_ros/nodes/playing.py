@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from csas_shadow_ros.bags import BagReader
-from csas_shadow_ros.core.errors import BagError
+from csas_shadow_ros.core.errors import BagError, ParameterError
+from msg_adapters import TOPICS, VIEW_STREAMS
 from msg_adapters.messages import NANOSECONDS
 from msg_adapters.topics import stream as stream_of
 
@@ -38,6 +39,27 @@ def holds(reader: BagReader, relative: str) -> bool:
     """Say whether a bag has messages of a topic."""
     info = reader.topic(relative)
     return info is not None and info.count > 0
+
+
+def topics_to_record(topics: str) -> list[str]:
+    """Return the topics that the recorder's parameter names.
+
+    Raises
+    ------
+    ParameterError
+        If one is not in the contract.
+    """
+    names = list(TOPICS) if topics == "all" else [t.strip() for t in topics.split(",") if t.strip()]
+    if unknown := [n for n in names if n not in TOPICS]:
+        raise ParameterError(f"topics names {unknown[0]!r}; expected some of: {', '.join(TOPICS)}")
+    return names
+
+
+def recorded_streams(topics: str) -> list[str]:
+    """Return the streams of which a recorder of these topics keeps both image and camera_info."""
+    names = set(topics_to_record(topics))
+    flowing = [stream_of(name) for name in (*VIEW_STREAMS, "sector")]
+    return [s.name for s in flowing if {s.image_topic, s.info_topic} <= names]
 
 
 def stage_of_bag(reader: BagReader, wanted: str = "auto") -> str:

@@ -52,9 +52,10 @@ class ShadowLikelihoodNode(CsasNode):
         levels = view_levels(view, p)
         # The mask goes first: once the likelihood is in the grid the view may count as done.
         target = self.target.target
-        if self.mask is not None and target is not None:
+        if self.mask is not None and self.mask.wanted and target is not None:
             self.mask.send(segment_shadow(view, target.position_m, p, levels, reach_m=target.reach_m))
-        self.likelihood.send(outside_likelihood(view, p, levels))
+        if self.likelihood.wanted:
+            self.likelihood.send(outside_likelihood(view, p, levels))
         return PUBLISHED
 
 

@@ -9,11 +9,11 @@ import math
 import sys
 from typing import Any
 
-from csas_shadow_ros.bags.check import ERROR, judge_coverage, judge_image
+from csas_shadow_ros.bags.check import ERROR, judge_band, judge_coverage, judge_geometry, judge_image
 from csas_shadow_ros.core.errors import CsasError, TrackError, ViewError
 from csas_shadow_ros.core.geometry import CoherentImage, Track
 from csas_shadow_ros.core.parameters import SubApertureParameters, TargetParameters
-from csas_shadow_ros.core.sector import Sector, image_from_sectors
+from csas_shadow_ros.core.streaming import Stream
 from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.core.target import Target, choose_target, find_target, spectrum_sign_evidence
 from msg_adapters import (
@@ -31,6 +31,13 @@ from msg_adapters import (
 from . import qos
 from .base import INTEGRATED, CsasNode, Inlet, Source, run_node
 from .params import part
+
+#: Counts of a stream that somebody should hear of, and what they mean.
+_IRREGULAR = {
+    "repeated": "came again; it counts once",
+    "out_of_order": "came after later ones; the result is the same",
+    "late": "came after views that it changes were made; all views are made again",
+}
 
 
 class SubApertureNode(CsasNode):
@@ -50,29 +57,58 @@ class SubApertureNode(CsasNode):
         self.sector_inlet = Inlet(self, "sector", "sink", self.take_sector)
         self.follow_sources()
         self.begin_guard = self.trigger(self.begin)
+        self.stream_guard = self.trigger(self.advance)
+        self.every(0.05, self.begin_again)
 
     def forget(self) -> None:
         """Drop the run."""
         self.image: CoherentImage | None = None
         self.image_stamp: int | None = None
         self.track: Track | None = None
-        self.sectors: dict[int, Sector] = {}
+        #: A run that comes as sectors; None before the first one.
+        self.stream: Stream | None = None
+        self.revision = 0
+        #: Views of the stream that are due as soon as the views of the target before are done.
+        self.due: list[int] = []
+        self.target_sent = 0
+        self.source_ended = False
+        self.refusals_sent: set[float] = set()
         self.sub_apertures: SubApertures | None = None
         self.aspects: dict[int, float] = {}
         self.failed = False
 
     def waiting(self) -> str:
         """Say which input is missing."""
+        if self.stream is not None and (text := self.waiting_of_stream(self.stream)):
+            return text
         if self.sub_apertures is not None:
             return self.source.flow.waiting_for() and f"waiting for {self.source.flow.waiting_for()}"
-        if self.image is None and self.sectors:
-            return f"waiting for the end of the sectors ({len(self.sectors)} are here)"
+        if self.stream is not None:
+            return ""
         missing = [n for n, x in (("image", self.image), ("track", self.track)) if x is None]
         return f"waiting for {' and '.join(missing)}" if missing else ""
 
+    def waiting_of_stream(self, stream: Stream) -> str:
+        """Say what is missing of a run that comes as sectors."""
+        if stream.track is None:
+            return "waiting for track"
+        arc = math.degrees(stream.sum.arcs.covered_rad)
+        if not stream.target_known:
+            return f"waiting for more sectors to find the target in ({arc:.0f}° are here)"
+        if stream.ended and (missing := stream.missing()):
+            return f"no sectors came of {', '.join(map(str, missing))}"
+        if self.source.flow.held:
+            return "waiting until the views of the target before have left the graph"
+        return "" if stream.ended else f"waiting for more sectors ({arc:.0f}° are here)"
+
     def state_counts(self) -> dict[str, int]:
-        """Return how many sectors there are."""
-        return {"sectors": len(self.sectors)}
+        """Return how many sectors there are, how they came, and the arc that they cover."""
+        if self.stream is None:
+            return {"sectors": 0}
+        counts, arcs = self.stream.counts, self.stream.sum.arcs
+        names = ("sectors", "repeated", "out_of_order", "late")
+        state = {name if name == "sectors" else f"sectors_{name}": counts[name] for name in names}
+        return state | {"arc_deg": round(math.degrees(arcs.covered_rad)), "revision": self.stream.revision}
 
     # Inputs
 
@@ -94,6 +130,8 @@ class SubApertureNode(CsasNode):
                     " configure the node again for another run"
                 )
             return
+        if self.stream is not None:
+            raise ViewError(f"image stamped {stamp} ns came during a run of sectors; it is not used")
         self.image = coherent_image_from_msgs(*pair)
         self.image_stamp = stamp
         self.begin_guard.trigger()
@@ -101,6 +139,11 @@ class SubApertureNode(CsasNode):
     def take_track(self, msg: Any) -> None:
         """Take the track; of a track that grows during the run the longest is the whole."""
         track = track_from_msg(msg)
+        if self.stream is not None:
+            if self.stream.take_track(track):
+                self.stream_guard.trigger()
+            self.track = self.stream.track
+            return
         if self.sub_apertures is not None:
             if len(track) > len(self.sub_apertures.track):
                 raise TrackError(
@@ -118,19 +161,99 @@ class SubApertureNode(CsasNode):
     def take_sector(self, image: Any, info: Any) -> str:
         """Take one sector."""
         sector = sector_from_msgs(image, info)
-        if self.image_stamp is None:
-            self.sectors.setdefault(sector.stamp_ns, sector)
+        if self.image_stamp is not None:
+            return INTEGRATED  # the run is here as a whole
+        if self.stream is None:
+            p = self.parameters
+            self.stream = Stream(
+                part(p, SubApertureParameters),
+                part(p, TargetParameters),
+                first_search_deg=p.first_search_deg,
+            )
+            if self.track is not None:
+                self.stream.take_track(self.track)
+            self.source.flow.more_to_come = True
+        before = dict(self.stream.counts)
+        self.stream.add(sector)
+        for name, what in _IRREGULAR.items():
+            if self.stream.counts[name] > before.get(name, 0):
+                self.log_throttled(name, f"sector at {sector.stamp_ns} ns {what}", "warn")
+        self.stream_guard.trigger()
         return INTEGRATED
 
     def on_source(self, beat: Heartbeat) -> None:
-        """Sum the sectors once their source says that they are all here."""
-        if self.image_stamp is not None or not self.sectors or beat.values.get("stream") != "sector":
+        """Close the run once the source of the sectors says that they are all here."""
+        if self.stream is None or beat.values.get("stream") != "sector":
             return
-        if self.sector_inlet.instance in beat.values.get("finished_for", "").split():
-            # In order of stamp: a sum of floats in another order would be another image.
-            self.image = image_from_sectors(self.sectors[s] for s in sorted(self.sectors))
-            self.image_stamp = self.image.stamp_ns
-            self.begin_guard.trigger()
+        here = self.sector_inlet.instance in beat.values.get("finished_for", "").split()
+        if here and not self.source_ended:
+            self.source_ended = True
+            self.stream.finish()
+            self.stream_guard.trigger()
+
+    # A run that comes as sectors
+
+    def advance(self) -> None:
+        """Offer the views that can be made by now; begin again where the target or the views have changed."""
+        stream, flow = self.stream, self.source.flow
+        if stream is None or self.failed:
+            return
+        try:
+            self.judge_stream(stream)
+            due = stream.update()
+        except CsasError as error:
+            self.fail(error)
+            return
+        if not stream.target_known:
+            return
+        if stream.revision != self.revision or not self.target_sent:
+            self.revision, self.due, flow.held = stream.revision, [], True
+        self.due += due
+        if flow.held:
+            self.begin_again()
+        else:
+            self.offer_due(stream)
+
+    def begin_again(self) -> None:
+        """Publish another target, and offer its views, once those of the one before have left the graph."""
+        stream, flow = self.stream, self.source.flow
+        if stream is None or not flow.held or flow.in_flight:
+            return
+        self.target_sent = max(stream.sum.newest_ns, self.target_sent + 1)
+        self.publish_target(stream.target, self.target_sent, may_move=True)
+        flow.begin_again(str(self.target_sent))
+        self.aspects, flow.held = {}, False
+        self.offer_due(stream)
+
+    def offer_due(self, stream: Stream) -> None:
+        """Offer the views that are due."""
+        flow = self.source.flow
+        self.sub_apertures = stream.sub_apertures
+        if self.due:
+            self.aspects |= {stamp: stream.aspect_of(stamp) for stamp in self.due}
+            flow.offer(self.due)
+            self.due = []
+            self.source.wake()
+        if stream.final:
+            for aspect, reason in stream.refused.items():
+                if aspect not in self.refusals_sent:
+                    self.refusals_sent.add(aspect)
+                    self.source.refused(self.target_sent, reason, aspect_deg=f"{math.degrees(aspect):.6g}")
+        flow.more_to_come = not stream.final
+
+    def judge_stream(self, stream: Stream) -> None:
+        """Raise if image and track contradict each other; of the whole run also by what the image shows."""
+        if stream.track is None or not stream.sum.stamps or stream.final:
+            return
+        frame = stream.sum.frame
+        if stream.ended:
+            found = [*judge_image(stream.sum.image(), stream.track)]
+        else:
+            found = [*judge_geometry(frame.grid, stream.track)]
+            found += judge_band(frame.grid, frame.acoustics, stream.track)
+        for level, problem, remedy in found:
+            if level == ERROR:
+                raise ViewError(f"{problem}. {remedy}")
 
     # Views
 
@@ -147,18 +270,25 @@ class SubApertureNode(CsasNode):
             p = part(self.parameters, SubApertureParameters)
             self.sub_apertures = SubApertures(self.image, self.track, p, spectrum=spectrum)
         except CsasError as error:
-            # The run cannot be processed at all: said once, and in every heartbeat.
-            self.failed, self.error = True, f"{type(error).__name__}: {error}"
-            self.get_logger().error(self.error)
+            self.fail(error)
             return
+        self.publish_target(target, self.image_stamp or 0)
+        self.list_views(self.sub_apertures)
+        # Its spectrum is all that the views are made of: the pixels need not stay in memory.
+        self.image = None
+
+    def fail(self, error: CsasError) -> None:
+        """Say that the run cannot be processed at all: once, and in every heartbeat."""
+        self.failed, self.error = True, f"{type(error).__name__}: {error}"
+        self.get_logger().error(self.error)
+
+    def publish_target(self, target: Target | None, stamp: int, *, may_move: bool = False) -> None:
+        """Publish the volume to carve, or that there is no object."""
         box = None
         if target is not None:
             x, y = target.position_m
             box = TargetBox((x, y, target.size_m[2] / 2.0), target.size_m)
-        self.target.publish(target_to_msg(self.messages, box, self.image_stamp or 0))
-        self.list_views(self.sub_apertures)
-        # Its spectrum is all that the views are made of: the pixels need not stay in memory.
-        self.image, self.sectors = None, {}
+        self.target.publish(target_to_msg(self.messages, box, stamp, may_move=may_move))
 
     def find_target(self, image: CoherentImage, track: Track, spectrum: Spectrum) -> Target | None:
         """Find the target as the in-process pipeline does."""

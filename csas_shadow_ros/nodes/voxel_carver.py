@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from typing import Any
 
+from numpy.typing import NDArray
+from rclpy.publisher import Publisher
+
+from csas_shadow_ros.core.arcs import Arc, Arcs
 from csas_shadow_ros.core.carving import Carver
 from csas_shadow_ros.core.errors import NoTargetError, ParameterError
-from csas_shadow_ros.core.mesh import mesh_from_grid
+from csas_shadow_ros.core.geometry import looks_at
+from csas_shadow_ros.core.mesh import Dimensions, measure, mesh_from_grid
 from csas_shadow_ros.core.parameters import CarvingParameters
 from csas_shadow_ros.core.segmentation import require_silhouette
 from csas_shadow_ros.core.volume import Volume
@@ -38,15 +44,24 @@ class VoxelCarverNode(CsasNode):
         self.voxels = self.publisher("voxels", qos.LATCHED)
         self.mesh = self.publisher("mesh", qos.LATCHED)
         self.stream = "shadow_mask" if p.takes_masks else "likelihood"
-        self.target = TargetInlet(self, lambda: self.inlet.release())
+        self.target = TargetInlet(self, lambda: self.inlet.release(), self.begin_again)
         self.inlet = Inlet(self, self.stream, "sink", self.work, hold=self.target.missing)
         self.growing = Growing(self.publish_result, self.wanted, p.publish_hz)
         self.follow_sources()
+        # More often than a node's own tick: a sector's last view is to be shown at once.
+        self.every(0.02, self.show)
 
     def forget(self) -> None:
         """Drop the grid."""
         self.carver: Carver | None = None
         self.object_voxels = 0
+        self.arcs = Arcs()
+        self.dimensions: Dimensions | None = None
+
+    def begin_again(self) -> None:
+        """Drop the grid of a target that has moved."""
+        self.forget()
+        self.growing.changed()
 
     def waiting(self) -> str:
         """Say so if views wait for the target."""
@@ -56,18 +71,30 @@ class VoxelCarverNode(CsasNode):
         """Return how many views the grid holds, and whether that is all."""
         held = len(self.carver.stamps) if self.carver else 0
         complete = hasattr(self, "growing") and self.growing.complete
-        return {"views": held, "complete": int(complete)}
+        arc = round(math.degrees(self.arcs.covered_rad))
+        return {"views": held, "complete": int(complete), "arc_deg": arc}
 
-    def work(self, image: Any, info: Any) -> str:
+    def state_values(self) -> dict[str, str]:
+        """Return how large the object is as far as it has been seen."""
+        d = self.dimensions
+        if d is None:
+            return {}
+        return {name: f"{getattr(d, name):.3f}" for name in ("length_m", "width_m", "height_m")}
+
+    def work(self, image: Any, info: Any) -> str | None:
         """Integrate one view; one that is in already changes nothing."""
         view = view_from_msgs(image, info, self.stream)
         target = self.target.target
         if target is None:
             raise NoTargetError("no target: topic target says that there is no object in the scene")
+        if self.target.may_move and not looks_at(view.info, target.position_m):
+            return None  # of the target before; the view of this one is on its way
         if self.carver is None:
             p = part(self.parameters, CarvingParameters)
             self.carver = Carver(Volume.around(target.position_m, target.size_m, p.voxel_size_m), p)
         if self.carver.integrate(require_silhouette(view) if self.stream == "shadow_mask" else view):
+            half = view.info.aperture_rad / 2.0
+            self.arcs.add(Arc(view.info.aspect_rad - half, 2.0 * half))
             self.growing.changed()
         return INTEGRATED
 
@@ -76,8 +103,10 @@ class VoxelCarverNode(CsasNode):
         if beat.values.get("stream") != "sector":
             self.growing.source_says(self.inlet.instance in beat.values.get("finished_for", "").split())
 
-    def tick(self) -> None:
+    def show(self) -> None:
         """Publish what has changed."""
+        if not self.active:
+            return
         before = self.growing.complete
         self.growing.period_s = 1.0 / self.parameters.publish_hz
         self.growing.tick(time.monotonic())
@@ -88,25 +117,40 @@ class VoxelCarverNode(CsasNode):
 
     def wanted(self) -> bool:
         """Say whether anybody looks at unfinished results."""
-        return any(p.get_subscription_count() for p in (self.grid_image, self.voxels, self.mesh))
+        return looked_at(self.grid_image, self.voxels, self.mesh)
 
     def publish_result(self) -> None:
-        """Publish grid, voxels and mesh as they are."""
+        """Publish grid, voxels and mesh as they are; an unfinished one to those who look alone."""
         if self.carver is None:
             # Nothing came: no object as far as anybody knows.
             self.mesh.publish(mesh_to_msg(self.messages, None, self.now_ns()))
             return
-        grid, stamp = self.carver.grid(), max(self.carver.stamps)
+        # Until all views are here the first look does: the second goes through all the silhouettes again.
+        final = self.growing.final
+        grid = self.carver.grid() if final else self.carver.first_look()
+        stamp = max(self.carver.stamps)
         self.object_voxels = int(grid.occupied.sum())
-        image, info = voxel_grid_to_msgs(self.messages, grid.volume, grid.likelihood, stamp)
-        self.grid_info.publish(info)
-        self.grid_image.publish(image)
-        image, info = voxel_grid_to_msgs(self.messages, grid.volume, grid.views, stamp, "voxel_views")
-        self.views_info.publish(info)
-        self.views_image.publish(image)
-        self.voxels.publish(voxels_to_msg(self.messages, grid, stamp))
+        pairs: dict[str, tuple[Publisher, Publisher, NDArray[Any]]] = {
+            "voxel_grid": (self.grid_info, self.grid_image, grid.likelihood),
+            "voxel_views": (self.views_info, self.views_image, grid.views),
+        }
+        for name, (info_publisher, image_publisher, values) in pairs.items():
+            if final or looked_at(info_publisher, image_publisher):
+                image, info = voxel_grid_to_msgs(self.messages, grid.volume, values, stamp, name)
+                info_publisher.publish(info)
+                image_publisher.publish(image)
+        if final or looked_at(self.voxels):
+            self.voxels.publish(voxels_to_msg(self.messages, grid, stamp))
         mesh = mesh_from_grid(grid) if grid.occupied.any() else None
-        self.mesh.publish(mesh_to_msg(self.messages, mesh, stamp))
+        self.dimensions = measure(mesh) if mesh is not None else None
+        # A mesh of ten thousand triangles takes longer to write as a message than to carve from a view.
+        if final or looked_at(self.mesh):
+            self.mesh.publish(mesh_to_msg(self.messages, mesh, stamp))
+
+
+def looked_at(*publishers: Publisher) -> bool:
+    """Say whether anybody subscribes to one of the topics."""
+    return any(publisher.get_subscription_count() for publisher in publishers)
 
 
 def main() -> int:

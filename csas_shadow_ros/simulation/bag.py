@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ..core.sector import Sector
 from .run import SimulatedRun, simulate
+from .sectors import sectors_of_run
 
 
 def simulate_bag(
-    path: str | Path, *args: Any, encoding: str = "32FC2", overwrite: bool = False, **kwargs: Any
+    path: str | Path,
+    *args: Any,
+    encoding: str = "32FC2",
+    overwrite: bool = False,
+    sectors_deg: float = 0.0,
+    **kwargs: Any,
 ) -> SimulatedRun:
     """Simulate a run, write it as a complete bag, and write ``<path>.truth.stl`` and ``.json`` beside it.
 
@@ -23,6 +31,8 @@ def simulate_bag(
         Pixel encoding of the image: ``32FC2``, ``64FC2``, ``16SC2`` or ``8SC2``.
     overwrite : bool
         Replace a bag that is there.
+    sectors_deg : float
+        Write the image as sectors of so much arc, as they would come during the run; 0: as it is.
 
     Returns
     -------
@@ -38,6 +48,17 @@ def simulate_bag(
     from ..bags import write_run
 
     run = simulate(*args, **kwargs)
-    write_run(path, run.image, run.track, encoding=encoding, overwrite=overwrite)
+    how: dict[str, Any] = {"encoding": encoding, "overwrite": overwrite}
+    if sectors_deg:
+        times: dict[int, int] = {}
+
+        def timed() -> Iterator[Sector]:
+            for sector, when in sectors_of_run(run.image, run.track, sectors_deg):
+                times[sector.stamp_ns] = when
+                yield sector
+
+        write_run(path, None, run.track, sectors=timed(), sector_times_ns=times, **how)
+    else:
+        write_run(path, run.image, run.track, **how)
     run.truth.save(path)
     return run

@@ -31,18 +31,19 @@ class Consumer:
         role: str = "sink",
         stream: str = "likelihood",
         n: int = 1,
+        **values: str,
     ) -> None:
         self.flow, self.node, self.role, self.stream = flow, node, role, stream
         self.instance = f"{node}-{n}"
-        self.beat()
+        self.beat(**values)
 
     def beat(self, **values: str) -> None:
         values = {"input": self.stream, **values}
         self.flow.heard(Heartbeat(0, self.node, self.instance, self.role, {}, values))
 
-    def report(self, stamp: int, reason: str = "") -> None:
+    def report(self, stamp: int, reason: str = "", **more: str) -> None:
         outcome = "rejected" if reason else "integrated" if self.role == "sink" else "published"
-        values = {"role": self.role, "input": self.stream}
+        values = {"role": self.role, "input": self.stream, **more}
         self.flow.heard(ViewProgress(stamp, self.node, self.instance, outcome, reason, values=values))
 
 
@@ -108,6 +109,71 @@ def test_a_sink_that_restarts_gets_every_view_again_and_the_other_sink_does_not_
             again.report(stamp)
     assert got == [1, 2, 3, 4, 5, 6]
     assert set(flow.finished_for()) == {again.instance, recorder.instance}
+
+
+def finish_run(flow: Flow, *sinks: Consumer) -> None:
+    """Have every sink report every view."""
+    for _ in range(100):
+        if flow.finished:
+            return
+        for stamp in take_all(flow):
+            for sink in sinks:
+                sink.report(stamp)
+    raise AssertionError(f"not finished: {flow.done} of {flow.total}, waiting for {flow.waiting_for()!r}")
+
+
+def test_a_run_is_not_over_at_the_very_moment_when_a_killed_recorder_is_back() -> None:
+    flow, clock = make_flow(6)
+    carver, recorder = Consumer(flow), Consumer(flow, "bag_recorder")
+    flow.look()
+    finish_run(flow, carver, recorder)
+    wait(flow, clock, 4.0, carver)  # the recorder is killed after its last report
+    assert not flow.finished
+    again = Consumer(flow, "bag_recorder", n=2)  # nobody has looked since
+    assert not flow.finished, "its successor has reported nothing"
+    assert again.instance not in set(flow.finished_for())
+    finish_run(flow, carver, again)
+    assert again.instance in set(flow.finished_for())
+
+
+@pytest.mark.parametrize("stream", ["sub_aperture", "shadow", "likelihood", "shadow_mask"])
+def test_a_recorder_that_does_not_know_yet_who_publishes_does_not_say_goodbye_for_its_predecessor(
+    stream: str,
+) -> None:
+    flow, clock = make_flow(6)
+    carver, recorder = Consumer(flow, stream="shadow_mask"), Consumer(flow, "bag_recorder", stream=stream)
+    flow.look()
+    for stamp in take_all(flow):
+        carver.report(stamp)
+        recorder.report(stamp)
+    wait(flow, clock, 4.0, carver)  # killed: the carver alone gets the rest
+    again = Consumer(flow, "bag_recorder", stream=stream, n=2, idle="true")
+    again.report(1, idle="true")  # what it took over
+    flow.look()
+    for _ in range(6):
+        for stamp in take_all(flow):
+            carver.report(stamp)
+    assert flow.in_flight == 0
+    assert not flow.finished, "the only one who keeps the stream is not there yet"
+    again.beat()
+    flow.look()
+    assert not flow.finished
+    got = take_all(flow)
+    for stamp in got:
+        again.report(stamp)
+    got += take_all(flow)
+    assert got == [2, 3, 4, 5, 6]
+    again.report(6)
+    assert flow.finished
+
+
+def test_a_recorder_whose_stream_nobody_publishes_is_waited_for_by_nobody() -> None:
+    flow, _ = make_flow(6)
+    carver = Consumer(flow)
+    Consumer(flow, "bag_recorder", stream="shadow_mask", idle="true")
+    flow.look()
+    finish_run(flow, carver)
+    assert list(flow.finished_for()) == [carver.instance]
 
 
 def test_a_stage_that_restarts_gets_only_what_had_not_got_through() -> None:

@@ -1,0 +1,534 @@
+"""Views while the vehicle still circles: sectors are summed as they come, a view is made once it is whole.
+
+A sector is one arc of the full-circle image, so its spectrum is one arc of the image's spectrum. `SectorSum`
+adds that arc alone, so a view needs no more than the sectors that overlap its aperture, and what it is
+made of does not change any more when others come: it is the view of the whole run, bit for bit. `Stream`
+says which views can be made, and about which target: a provisional one while the circle is open, the
+whole run's once it is closed. Where that makes a difference, everything is due again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import replace
+
+import numba
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from .arcs import TOLERANCE_RAD, Arc, Arcs
+from .carving import Carver
+from .errors import GeometryError, NoTargetError, ViewError
+from .geometry import TWO_PI, CoherentImage, Track
+from .parameters import PipelineParameters, SubApertureParameters, TargetParameters
+from .pipeline import ProcessedView, in_order, process_view
+from .sector import Sector, same_grid
+from .segmentation import require_silhouette
+from .subaperture import Spectrum, SubApertures
+from .target import Target, choose_target, find_target, spectrum_sign_evidence
+from .volume import Volume, VoxelGrid
+
+#: Sectors share so much at their common edge that rounding leaves no bin to neither.
+_EDGE_RAD = 1e-4
+#: So much of a sector's energy may lie beyond its arc and be left out: nothing but rounding at the edge
+#: itself; and -30 dB of sidelobes and rounded pixels half a sector further out.
+_BEYOND_EDGE, _BEYOND_HALF = 1e-6, 1e-3
+#: A wavenumber under this fraction of the band's lower edge would need a grazing angle over 66°.
+_LEAST_COSINE = 0.4
+#: After a search that found nothing the next one waits for so much more arc.
+_SEARCH_AGAIN_RAD = math.radians(30.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _arc_of_box(
+    box: NDArray[np.complex64],
+    first: tuple[int, int],
+    steps: tuple[float, float],
+    low: float,
+    high: float,
+    whole: bool,
+    out: NDArray[np.complex64],
+) -> float:  # pragma: no cover
+    """Return the energy of a box of the spectrum between two angles; add it to `out` unless that is empty."""
+    rows, cols = out.shape
+    cos_l, sin_l, cos_h, sin_h = math.cos(low), math.sin(low), math.cos(high), math.sin(high)
+    cos_m, sin_m = math.cos((low + high) / 2.0), math.sin((low + high) / 2.0)
+    energy = 0.0
+    for i in range(box.shape[0]):
+        ky = -(first[0] + i) * steps[0]
+        for j in range(box.shape[1]):
+            if not whole:
+                kx = (first[1] + j) * steps[1]
+                # An arc is narrower than half a turn: its middle is ahead.
+                if (
+                    cos_l * ky - sin_l * kx < 0.0
+                    or cos_h * ky - sin_h * kx > 0.0
+                    or cos_m * kx + sin_m * ky <= 0.0
+                ):
+                    continue
+            value = box[i, j]
+            energy += float(value.real) * float(value.real) + float(value.imag) * float(value.imag)
+            if rows:
+                out[(first[0] + i) % rows, (first[1] + j) % cols] += value
+    return energy
+
+
+def _cut(spectrum: NDArray[np.complex64], first: int, count: int, axis: int) -> NDArray[np.complex64]:
+    """Return `count` bins from signed bin `first` on, along one axis of a spectrum in FFT order."""
+    size, last = spectrum.shape[axis], first + count
+    if first < 0 < last:
+        parts = [slice(size + first, size), slice(0, last)]
+    else:
+        parts = [slice(first % size, first % size + count)]
+    found = [spectrum[part] if axis == 0 else spectrum[:, part] for part in parts]
+    return np.concatenate(found, axis) if len(found) > 1 else found[0]
+
+
+class SectorSum:
+    """The full-circle spectrum, summed from sectors in any order as they come.
+
+    Parameters
+    ----------
+    workers : int
+        Threads of the transforms.
+
+    Notes
+    -----
+    Of each sector only its arc of the spectrum is added, and a little more at both ends: 1e-4 rad where its
+    energy ends sharply, half its width where it does not. Every bin then gets at most two sectors of a
+    partition, whose sum does not depend on their order. A sector whose energy lies elsewhere is added whole.
+
+    One spectrum of the image's size is held, however many sectors come.
+    """
+
+    def __init__(self, workers: int = 2) -> None:
+        self._workers = workers
+        self._first: Sector | None = None
+        self._spectrum: Spectrum | None = None
+        self.arcs = Arcs()
+        #: Stamps of the sectors that are in.
+        self.stamps: set[int] = set()
+        #: The furthest that any sector reaches beyond its arc (rad).
+        self.margin_rad = _EDGE_RAD
+
+    @property
+    def newest_ns(self) -> int:
+        """The latest stamp; 0 before the first sector."""
+        return max(self.stamps, default=0)
+
+    @property
+    def spectrum(self) -> Spectrum:
+        """What has been summed so far.
+
+        Raises
+        ------
+        GeometryError
+            If nothing has.
+        """
+        if self._spectrum is None:
+            raise GeometryError("there are no sectors to sum; expected at least one")
+        return self._spectrum
+
+    @property
+    def frame(self) -> CoherentImage:
+        """The image's lattice and band, with pixels that take no memory and hold nothing."""
+        if self._first is None:
+            raise GeometryError("there are no sectors to sum; expected at least one")
+        blank = np.broadcast_to(np.complex64(0), self._first.grid.shape)
+        return CoherentImage(blank, self._first.grid, self._first.acoustics, self.newest_ns)
+
+    def image(self) -> CoherentImage:
+        """Transform the sum back to the coherent image, stamped with the last sector's stamp."""
+        frame = self.frame
+        pixels = scipy.fft.ifft2(self.spectrum.values, norm="forward", workers=self._workers)
+        rows, cols = frame.grid.shape
+        return CoherentImage(
+            np.ascontiguousarray(pixels[:rows, :cols]), frame.grid, frame.acoustics, frame.stamp_ns
+        )
+
+    def add(self, sector: Sector) -> Arc | None:
+        """Add a sector.
+
+        Returns
+        -------
+        Arc or None
+            The arc of the spectrum that it changed; None if a sector of its stamp is in already.
+
+        Raises
+        ------
+        GeometryError
+            If its grid or band is not the first one's, its arc is no arc, or a pixel is not finite.
+        """
+        if sector.stamp_ns in self.stamps:
+            return None
+        self._check(sector)
+        pixels = np.ascontiguousarray(sector.pixels, np.complex64)
+        empty = np.empty((0, 0), np.complex64)
+        energy = _arc_of_box(pixels, (0, 0), (1.0, 1.0), 0.0, 0.0, True, empty) / pixels.size
+        if not math.isfinite(energy):
+            bad = np.argwhere(~np.isfinite(sector.pixels))
+            where = f", first pixel (row {bad[0, 0]}, col {bad[0, 1]})" if len(bad) else ""
+            raise GeometryError(
+                f"sector at {sector.stamp_ns} ns holds {len(bad)} pixels that are not finite{where};"
+                " expected finite numbers"
+            )
+        if self._spectrum is None:
+            shape = tuple(scipy.fft.next_fast_len(n) for n in sector.grid.shape)
+            self._first = replace(sector, pixels=np.broadcast_to(np.complex64(0), sector.grid.shape))
+            self._spectrum = Spectrum(np.zeros(shape, np.complex64), sector.grid)
+        arc = Arc(sector.aspect_rad - sector.aperture_rad / 2.0, sector.aperture_rad)
+        margin = self._add(sector, arc, energy)
+        self.stamps.add(sector.stamp_ns)
+        self.arcs.add(arc)
+        self.margin_rad = max(self.margin_rad, margin)
+        return arc.widened(margin)
+
+    def _check(self, sector: Sector) -> None:
+        if not 0.0 < sector.aperture_rad <= TWO_PI * (1.0 + 1e-9) or not math.isfinite(sector.aspect_rad):
+            raise GeometryError(
+                f"sector at {sector.stamp_ns} ns has aspect {math.degrees(sector.aspect_rad):g}° and aperture"
+                f" {math.degrees(sector.aperture_rad):g}°; expected an arc of more than 0° and at most 360°"
+            )
+        first = self._first
+        if first is None:
+            return
+        if not same_grid(first.grid, sector.grid) or sector.acoustics != first.acoustics:
+            what = "band" if same_grid(first.grid, sector.grid) else "grid"
+            raise GeometryError(
+                f"sector at {sector.stamp_ns} ns has another {what} than the first at {first.stamp_ns} ns:"
+                f" {getattr(sector, 'grid' if what == 'grid' else 'acoustics')}; expected one for all"
+            )
+
+    def _add(self, sector: Sector, arc: Arc, energy: float) -> float:
+        """Add a sector's arc of the spectrum; return how far it reaches beyond the sector's."""
+        values, steps = self.spectrum.values, self.spectrum.step_rad_m
+        turn = 0.0 if sector.acoustics.spectrum_sign > 0 else math.pi
+        empty = np.empty((0, 0), np.complex64)
+        half = arc.width_rad / 2.0
+        # The image's energy and its zero-padded transform's differ by the padding.
+        energy *= sector.pixels.size / values.size
+        if arc.width_rad + 2.0 * half < math.pi:
+            first, shape = self._box(arc.widened(half), turn)
+            along_x, along_y = sector.carrier()
+            rows = np.asarray(sector.pixels * along_x[None, :], np.complex64)
+            rows = scipy.fft.fft(rows, values.shape[1], 1, "forward", True, workers=self._workers)
+            # The carrier along the other axis need only be put on the columns that are kept.
+            columns = _cut(rows, first[1], shape[1], 1) * along_y[:, None]
+            spectrum = scipy.fft.fft(columns, values.shape[0], 0, "forward", True, workers=self._workers)
+            box = _cut(spectrum, first[0], shape[0], 0)
+            for margin, beyond in ((_EDGE_RAD, _BEYOND_EDGE), (half, _BEYOND_HALF)):
+                low = arc.start_rad - margin + turn
+                high = low + arc.width_rad + 2.0 * margin
+                if _arc_of_box(box, first, steps, low, high, False, empty) >= (1.0 - beyond) * energy:
+                    _arc_of_box(box, first, steps, low, high, False, values)
+                    return margin
+        pixels = np.asarray(sector.on_carrier(), np.complex64)
+        values += scipy.fft.fft2(pixels, values.shape, norm="forward", workers=self._workers)
+        return math.pi
+
+    def _box(self, arc: Arc, turn: float) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Return (first row, column) and the shape of the spectrum's box round an arc of the band."""
+        steps = self.spectrum.step_rad_m
+        grid, acoustics = self.frame.grid, self.frame.acoustics
+        low, _, high = acoustics.ground_band(0.0)
+        nyquist = math.pi / grid.spacing_m
+        angles = arc.start_rad + turn + np.linspace(0.0, arc.width_rad, 129)
+        # Whatever lies straight along an axis is the extreme one.
+        quarters = np.arange(math.ceil(angles[0] / (math.pi / 2)), math.floor(angles[-1] / (math.pi / 2)) + 1)
+        angles = np.concatenate([angles, quarters * (math.pi / 2)])
+        rim = np.concatenate(
+            [
+                k * np.exp(1j * angles)
+                for k in (_LEAST_COSINE * low, min(1.1 * high, math.sqrt(2.0) * nyquist))
+            ]
+        )
+        row, col = -rim.imag / steps[0], rim.real / steps[1]
+        limits = []
+        for index, count in zip((row, col), self.spectrum.values.shape, strict=True):
+            a = max(math.floor(index.min()) - 1, -(count // 2))
+            b = min(math.ceil(index.max()) + 1, (count - 1) // 2)
+            limits.append((a, b - a + 1))
+        return (limits[0][0], limits[1][0]), (limits[0][1], limits[1][1])
+
+
+def part_of_track(track: Track, arcs: Arcs) -> Track | None:
+    """Return the poses whose aspects the arcs cover; None if they make no track."""
+    inside = arcs.contains(track.aspects_rad)
+    if int(inside.sum()) < 3:
+        return None
+    return Track(track.stamps_ns[inside], track.positions_m[inside], max_gap_rad=track.max_gap_rad)
+
+
+class Stream:
+    """What can be made of a run that is still going on.
+
+    Parameters
+    ----------
+    sub_aperture : SubApertureParameters
+        Aperture, step, taper, sampling, and whether the spectrum's sign is checked.
+    target : TargetParameters
+        A target given with its size is taken at once. Otherwise one is looked for.
+    first_search_deg : float
+        The arc that must be there for a provisional search; 360: none before the circle is closed.
+
+    Notes
+    -----
+    Whatever order the sectors come in, after `finish` target and views are those of the whole run.
+    `revision` counts how often all views became due again: when the target of the whole run is another than
+    the provisional one, a sector came late that changes views made before, or the track has grown.
+    """
+
+    def __init__(
+        self,
+        sub_aperture: SubApertureParameters | None = None,
+        target: TargetParameters | None = None,
+        *,
+        first_search_deg: float = 120.0,
+        workers: int = 2,
+    ) -> None:
+        self.parameters = sub_aperture or SubApertureParameters()
+        self.target_parameters = target or TargetParameters()
+        self.sum = SectorSum(workers)
+        self.track: Track | None = None
+        self.sub_apertures: SubApertures | None = None
+        #: Whether `target` has been decided on, for the time being or for good.
+        self.target_known = False
+        self.target: Target | None = None
+        #: Whether target and views are those of the whole run.
+        self.final = False
+        self.revision = 0
+        #: Sectors that came again, out of order, or too late for views that were made already.
+        self.counts: Counter[str] = Counter()
+        #: Aspects (rad) that no view can be made of, and why.
+        self.refused: dict[float, str] = {}
+        self._aspect_of: dict[int, float] = {}
+        self._given: set[int] = set()
+        self._all_here = False
+        self._stale = False
+        self._search_at_rad = math.radians(first_search_deg)
+
+    def take_track(self, track: Track) -> bool:
+        """Take the track, or a longer one; False if it is not longer."""
+        if self.track is not None and len(track) <= len(self.track):
+            return False
+        self._stale |= bool(self._given)
+        self.track, self.sub_apertures, self.final = track, None, False
+        return True
+
+    def add(self, sector: Sector) -> bool:
+        """Add a sector; False if it is in already.
+
+        Raises
+        ------
+        GeometryError
+            If it does not belong to the others.
+        """
+        newest = self.sum.newest_ns
+        changed = self.sum.add(sector)
+        if changed is None:
+            self.counts["repeated"] += 1
+            return False
+        self.counts["sectors"] += 1
+        self.counts["out_of_order"] += sector.stamp_ns < newest
+        if self.final or any(changed.touches(self._arc_of(self._aspect_of[s])) for s in self._given):
+            self.counts["late"] += 1
+            self._stale, self.final = True, False
+        return True
+
+    def finish(self) -> None:
+        """Say that no more sectors are to come; those that come nevertheless are late."""
+        self._all_here = True
+
+    @property
+    def ended(self) -> bool:
+        """Whether all sectors are here: the circle is closed, or their source said so."""
+        return self._all_here or self.sum.arcs.whole
+
+    def missing(self) -> list[Arc]:
+        """Return the arcs that the track covers, but no sector."""
+        if self.track is None:
+            return []
+        return [
+            arc
+            for arc in self.sum.arcs.missing()
+            if self.track.covered_fraction(arc.start_rad + arc.width_rad / 2.0, arc.width_rad) > 0.0
+        ]
+
+    def update(self) -> list[int]:
+        """Decide on the target as far as it can be, and return the stamps of the views that became due.
+
+        Raises
+        ------
+        CsasError
+            As `pipeline.run` does where the whole run cannot be processed, such as a wrong spectrum sign.
+        """
+        if self.track is None or not self.sum.stamps:
+            return []
+        if self.sub_apertures is None:
+            self._begin(self.track)
+        if self.ended and not self.final:
+            self._decide(self.track)
+        elif not self.target_known:
+            self._decide_for_now(self.track)
+        if not self.target_known:
+            return []
+        due = [
+            stamp
+            for stamp, aspect in self._aspect_of.items()
+            if stamp not in self._given and (self.ended or self._is_whole(aspect))
+        ]
+        self._given.update(due)
+        return due
+
+    def aspect_of(self, stamp_ns: int) -> float:
+        """Return the aspect (rad) of a view by its stamp."""
+        return self._aspect_of[stamp_ns]
+
+    def _begin(self, track: Track) -> None:
+        """List the views that the track allows."""
+        self.sub_apertures = SubApertures(self.sum.frame, track, self.parameters, spectrum=self.sum.spectrum)
+        self._aspect_of, self.refused = {}, {}
+        for aspect in map(float, self.sub_apertures.aspects_rad):
+            try:
+                stamp = self.sub_apertures.info(aspect).stamp_ns
+                if stamp in self._aspect_of:
+                    raise ViewError(
+                        f"view of aspect {math.degrees(aspect):.6g}° has the stamp {stamp} ns of another view"
+                    )
+            except ViewError as error:
+                self.refused[aspect] = str(error)
+                continue
+            self._aspect_of[stamp] = aspect
+        self._given &= set(self._aspect_of)
+
+    def _arc_of(self, aspect_rad: float) -> Arc:
+        width = math.radians(self.parameters.aperture_deg)
+        return Arc(aspect_rad - width / 2.0, width)
+
+    def _is_whole(self, aspect_rad: float) -> bool:
+        return self.sum.arcs.cover(self._arc_of(aspect_rad).widened(self.sum.margin_rad))
+
+    def _given_whole(self) -> Target | None:
+        p = self.target_parameters
+        if p.target == "given" and all(s > 0 for s in p.size_m):
+            return find_target(self.sum.frame, self.track, p, spectrum=self.sum.spectrum)  # type: ignore[arg-type]
+        return None
+
+    def _decide_for_now(self, track: Track) -> None:
+        """Take a given target, or look for one in the arc that is there."""
+        if (given := self._given_whole()) is not None:
+            self.target_known, self.target = True, given
+            return
+        if self.sum.arcs.covered_rad < self._search_at_rad - TOLERANCE_RAD:
+            return
+        part = part_of_track(track, self.sum.arcs)
+        self._search_at_rad = self.sum.arcs.covered_rad + _SEARCH_AGAIN_RAD
+        if part is None:
+            return
+        try:
+            self.target = find_target(
+                self.sum.frame, part, self.target_parameters, spectrum=self.sum.spectrum
+            )
+        except NoTargetError:
+            return  # nothing is there as far as this arc tells
+        self.target_known = self.target is not None
+
+    def _decide(self, track: Track) -> None:
+        """Find the target of the whole run; what was made for another one is due again."""
+        frame, spectrum, p = self.sum.frame, self.sum.spectrum, self.target_parameters
+        if self.parameters.check_sign:
+            sign, search = spectrum_sign_evidence(frame, track, spectrum=spectrum)
+            sign.check()
+            target = choose_target(search, p)
+        else:
+            target = find_target(frame, track, p, spectrum=spectrum)
+        moved = self.target_known and _place(target) != _place(self.target)
+        if self._given and (moved or self._stale):
+            self.revision += 1
+            self._given.clear()
+        self.target_known, self.target, self.final, self._stale = True, target, True, False
+
+
+def _place(target: Target | None) -> object:
+    return None if target is None else (target.position_m, target.size_m)
+
+
+class StreamedRun:
+    """The whole method on a run that is still going on: sectors in, a grid that grows.
+
+    Parameters
+    ----------
+    parameters : PipelineParameters
+        Every stage's parameters.
+    first_search_deg : float
+        See `Stream`.
+    workers : int
+        Threads.
+    """
+
+    def __init__(
+        self,
+        parameters: PipelineParameters | None = None,
+        *,
+        first_search_deg: float = 120.0,
+        workers: int = 2,
+    ) -> None:
+        self.parameters = parameters or PipelineParameters()
+        p = self.parameters
+        self.stream = Stream(p.sub_aperture, p.target, first_search_deg=first_search_deg, workers=workers)
+        self.carver: Carver | None = None
+        #: Reason for each stamp whose view could not be used.
+        self.rejected: dict[int, str] = {}
+        self._workers = workers
+        self._revision = 0
+
+    def take_track(self, track: Track) -> list[ProcessedView]:
+        """Take the track, or a longer one; return the views that became due."""
+        self.stream.take_track(track)
+        return self._advance()
+
+    def add(self, sector: Sector) -> list[ProcessedView]:
+        """Add a sector; return the views that became due, which are in the grid then."""
+        self.stream.add(sector)
+        return self._advance()
+
+    def finish(self) -> list[ProcessedView]:
+        """Say that no more sectors are to come; return the views that became due."""
+        self.stream.finish()
+        return self._advance()
+
+    def _advance(self) -> list[ProcessedView]:
+        stream, p = self.stream, self.parameters
+        due = stream.update()
+        target, sub_apertures = stream.target, stream.sub_apertures
+        if target is None or sub_apertures is None:
+            return []
+        if self.carver is None or stream.revision != self._revision:
+            self._revision, self.rejected = stream.revision, {}
+            volume = Volume.around(target.position_m, target.size_m, p.carving.voxel_size_m)
+            self.carver = Carver(volume, p.carving)
+
+        def make(stamp: int) -> ProcessedView | ViewError:
+            try:
+                return process_view(sub_apertures, stream.aspect_of(stamp), target, p)
+            except ViewError as error:
+                return error
+
+        made = []
+        for stamp, view in in_order(make, due, self._workers):
+            try:
+                if isinstance(view, ViewError):
+                    raise view
+                masks = p.carving.takes_masks
+                self.carver.integrate(require_silhouette(view.mask) if masks else view.likelihood)
+            except ViewError as error:
+                self.rejected[stamp] = str(error)
+                continue
+            made.append(view)
+        return made
+
+    def grid(self) -> VoxelGrid | None:
+        """Return the grid as it is; None before the first view."""
+        return self.carver.grid() if self.carver is not None and self.carver.stamps else None
