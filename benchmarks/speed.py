@@ -363,7 +363,11 @@ print(time.perf_counter() - began, result.views_used, int(result.grid.occupied.s
 
 
 def in_fresh_process(code: str, bag: Path) -> dict[str, float]:
-    """Run code in a process of its own; return its seconds, its result and the peak memory of its tree."""
+    """Run code in a process of its own; return its seconds, its result and the peak memory of its tree.
+
+    CPU time is that of all processes of the tree, which others' work on the machine hardly changes.
+    """
+    before = os.times()
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     process = subprocess.Popen(
         [sys.executable, "-c", code, str(bag)], stdout=subprocess.PIPE, text=True, env=environment
@@ -376,7 +380,9 @@ def in_fresh_process(code: str, bag: Path) -> dict[str, float]:
     if process.returncode:
         raise RuntimeError(f"a benchmark's process ended with status {process.returncode}; expected 0")
     seconds, views, voxels = map(float, out.split()[-3:])
-    return {"s": seconds, "views": views, "voxels": voxels, "peak_gib": peak / 2**20}
+    after = os.times()
+    cpu_s = after.children_user + after.children_system - before.children_user - before.children_system
+    return {"s": seconds, "cpu_s": cpu_s, "views": views, "voxels": voxels, "peak_gib": peak / 2**20}
 
 
 def descendants(pid: int) -> list[int]:
@@ -412,6 +418,9 @@ def measure_graph(work: Path) -> Report:
         "graph_s": float(np.median([g["s"] for g, _ in pairs])),
         "in_process_s": float(np.median([p["s"] for _, p in pairs])),
         "ratio": float(np.median([g["s"] / p["s"] for g, p in pairs])),
+        "graph_cpu_s": float(np.median([g["cpu_s"] for g, _ in pairs])),
+        "in_process_cpu_s": float(np.median([p["cpu_s"] for _, p in pairs])),
+        "load": list(os.getloadavg()),
         "same_voxels": all(g["voxels"] == p["voxels"] for g, p in pairs),
         "graph_peak_gib": max(g["peak_gib"] for g, _ in pairs),
         "in_process_peak_gib": max(p["peak_gib"] for _, p in pairs),
