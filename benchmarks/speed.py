@@ -68,6 +68,8 @@ TARGET = Target((0.0, 0.0), VOLUME_M)
 #: Rounds in which the two sides of a ratio take turns.
 ROUNDS = 12
 GRAPH_ROUNDS = 3
+#: From this multiple of real time on, `benchmarks/streaming.py` asks that a run keeps up.
+FAST_RATE = 4.0
 SAMDIS_CIRCLE_S = 314.0
 
 Report = dict[str, Any]
@@ -434,14 +436,12 @@ def measure_samdis(work: Path) -> Report:
 
 
 def measure_streaming(work: Path) -> Report:
-    """Take the streaming figures of ``benchmarks/streaming.py``, which is run if it is there."""
-    script = HERE / "streaming.py"
-    if not script.exists():
-        return {}
+    """Take the streaming figures of ``benchmarks/streaming.py``, whose exit status says whether they are met."""
     out = work / "streaming.json"
-    subprocess.run([sys.executable, str(script), "--json", str(out)], check=True)
-    found: Report = json.loads(out.read_text(encoding="utf-8"))
-    return found
+    subprocess.run([sys.executable, str(HERE / "streaming.py"), "--json", str(out)], check=False)
+    results = json.loads(out.read_text(encoding="utf-8"))["results"]
+    kept_up = [r["rate"] for r in results if r["rate"] >= FAST_RATE and r["met"]]
+    return {"p95_s": results[0]["p95_s"], "keeps_up_at": max(kept_up, default=0), "runs": results}
 
 
 def measure_growth(work: Path) -> Report:
@@ -561,7 +561,8 @@ def lines(report: Report) -> list[tuple[str, str, str, str]]:
     c = report.get("streaming") or {}
     if c:
         met = c["p95_s"] <= 0.5 and c["keeps_up_at"] >= 8
-        measured = f"p95 {c['p95_s']:.2f} s, {c['keeps_up_at']:g} x"
+        keeps = f"{c['keeps_up_at']:g} x" if c["keeps_up_at"] else "not at 8 x"
+        measured = f"p95 {c['p95_s']:.2f} s, {keeps}"
         add("streaming: sector to grid; keeps up at", measured, "<= 0.5 s, >= 8 x", met)
     else:
         add("streaming: sector to grid; keeps up at", "-", "<= 0.5 s, >= 8 x", None)

@@ -23,11 +23,12 @@ from .carving import Carver
 from .errors import GeometryError, NoTargetError, ViewError
 from .geometry import TWO_PI, CoherentImage, Track
 from .parameters import PipelineParameters, SubApertureParameters, TargetParameters
-from .pipeline import ProcessedView, in_order, process_view
+from .pipeline import ProcessedView, process_view
 from .sector import Sector, same_grid
 from .segmentation import require_silhouette
 from .subaperture import Spectrum, SubApertures
 from .target import Target, choose_target, find_target, spectrum_sign_evidence
+from .threads import in_order
 from .volume import Volume, VoxelGrid
 
 #: Sectors share so much at their common edge that rounding leaves no bin to neither.
