@@ -436,7 +436,7 @@ def measure_samdis(work: Path) -> Report:
 
 
 def measure_streaming(work: Path) -> Report:
-    """Take the streaming figures of ``benchmarks/streaming.py``, whose exit status says whether they are met."""
+    """Take the figures of ``benchmarks/streaming.py``, whose exit status says whether they are met."""
     out = work / "streaming.json"
     subprocess.run([sys.executable, str(HERE / "streaming.py"), "--json", str(out)], check=False)
     results = json.loads(out.read_text(encoding="utf-8"))["results"]

@@ -154,10 +154,14 @@ def levels_of_mask(mask: View) -> Levels:
 
 
 def _largest_piece(shadow: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(shadow.view(np.uint8), connectivity=8)
-    if count < 2:
+    x, y, width, height = cv2.boundingRect(shadow.view(np.uint8))
+    if not width:
         return None
-    return np.asarray(labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()))
+    box = np.s_[y : y + height, x : x + width]  # most of a view is no shadow
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(shadow[box].view(np.uint8), connectivity=8)
+    piece = np.zeros_like(shadow)
+    piece[box] = labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+    return piece
 
 
 def _side(
