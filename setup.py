@@ -36,11 +36,14 @@ CORE = [
     "rosbags>=0.11,<0.12",
     # Ray casting of simulated scenes; an x86-64 and arm64 wheel exists for every supported Python.
     "embreex>=2.17.7",
+    # The operator's view: its server, and pictures of views.
+    "aiohttp>=3.10,<4",
+    "pillow>=10.1",
 ]
 # ROS 2 Jazzy from PyPI, in versions that were tried together. Where ROS 2 is installed by other means
 # (apt, conda, source) this extra is not needed and would be in the way.
 ROS = ["ros-rclpy==7.1.6", "ros-rmw-fastrtps-cpp==8.4.3", "ros-common-interfaces==5.3.6"]
-TEST = ["pytest>=8", "pytest-xdist>=3.5", "hypothesis>=6.100", "ruff~=0.17.6", "mypy~=2.4.1"]
+TEST = ["pytest>=8", "pytest-xdist>=3.5", "hypothesis>=6.100", "playwright>=1.49,<2", "ruff~=0.17.6", "mypy~=2.4.1"]
 # setuptools 80 dropped what colcon's --symlink-install calls.
 BUILD = ["colcon-common-extensions>=0.3", "setuptools>=68,<80"]
 
