@@ -16,6 +16,7 @@ NODES = (
     "composites",
     "bag_player",
     "bag_recorder",
+    "viewer",
 )
 
 CORE = [

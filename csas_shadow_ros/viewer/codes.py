@@ -17,6 +17,8 @@ from ..core.errors import ViewError
 LOW_DB, STEP_DB = -32.0, 0.25
 #: Of every view so many pixels tell the median.
 _SAMPLE = 1 << 16
+#: Colour of what no view knows.
+_UNKNOWN = (24, 40, 96)
 Codes = NDArray[np.uint8]
 
 
@@ -47,6 +49,15 @@ def likelihood_codes(pixels: NDArray[Any]) -> Codes:
 def likelihood_of(codes: Codes) -> NDArray[np.float32]:
     """Return l_out of its codes, to half of 1/254."""
     return np.where(codes == 0, np.float32(np.nan), (codes.astype(np.float32) - 1.0) / np.float32(254.0))
+
+
+def shown(codes: Codes, kind: str) -> Codes:
+    """Return codes as they are shown: likelihoods as grey, blue where unknown; all else as it is."""
+    if kind != "likelihood":
+        return codes
+    grey = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
+    grey[0] = _UNKNOWN
+    return np.asarray(grey[codes])
 
 
 def picture(codes: NDArray[np.uint8], kind: str) -> bytes:

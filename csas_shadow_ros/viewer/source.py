@@ -89,6 +89,7 @@ class Shape:
         self._store = store
         self.parameters = parameters
         self._sides: dict[int, SilhouetteSides] = {}
+        self._taken: set[tuple[str, int]] = set()
         self._other: Carver | None = None
 
     @property
@@ -96,21 +97,40 @@ class Shape:
         """Which stream the other method takes."""
         return "shadow_mask" if self.parameters.other().takes_masks else "likelihood"
 
+    def pending(self) -> list[tuple[str, Entry]]:
+        """Return the likelihoods and masks in the store that have not been taken yet."""
+        main = self._store.grids.get("main")
+        if main is None:
+            return []
+        self._on(main.volume)
+        with self._store.lock:
+            return [
+                (name, entry)
+                for name in dict.fromkeys((self.other_stream, "shadow_mask"))
+                for entry in self._store.sets[name].values()
+                if (name, entry.info.stamp_ns) not in self._taken
+            ]
+
+    def _on(self, volume: Volume) -> Carver:
+        if self._other is None or self._other.volume != volume:
+            self._other, self._sides, self._taken = Carver(volume, self.parameters.other()), {}, set()
+        return self._other
+
     def add(self, name: str, entry: Entry) -> None:
         """Take one likelihood or mask."""
         main = self._store.grids.get("main")
         if main is None:
             return
         volume = main.volume
-        if self._other is None or self._other.volume != volume:
-            self._other, self._sides = Carver(volume, self.parameters.other()), {}
+        other = self._on(volume)
+        self._taken.add((name, entry.info.stamp_ns))
         pixels: NDArray[Any] = entry.load()
         if name == "likelihood":
             pixels = codes.likelihood_of(pixels)
         view = View(entry.info, pixels)
         try:
             if name == self.other_stream:
-                self._other.integrate(view)
+                other.integrate(view)
             if name == "shadow_mask":
                 x, y, _ = volume.centre_m
                 side = silhouette_sides(levels_of_mask(view), view, (x, y))

@@ -121,7 +121,6 @@ class ViewStore:
         self.lock = threading.RLock()
         #: Which store this is: another one (a restarted viewer) may hold another run.
         self.instance = uuid.uuid4().hex[:12]
-        self.aperture_deg: float | None = None
         #: Makes the reduced sub-apertures once they are asked for; None where there is no image.
         self.make_reduced: Callable[[], None] | None = None
         self._cache: OrderedDict[tuple[str, ...], bytes] = OrderedDict()
@@ -148,11 +147,12 @@ class ViewStore:
         for listener in list(self.listeners):
             listener(notice)
 
-    def reset(self) -> None:
-        """Forget the run: another one begins."""
+    def reset(self, *, keep: tuple[str, ...] = ()) -> None:
+        """Forget the run: another one begins; `keep` names the parts that are the new one's already."""
         with self.lock:
-            self.make_reduced = None
+            kept = {name: self._parts[name] for name in keep}
             self._clear()
+            self._parts |= kept
             self._tell({"type": "all", "scene": self.scene()})
 
     def scene(self) -> dict[str, Any]:
@@ -177,7 +177,7 @@ class ViewStore:
                 abs(math.remainder(e.info.aspect_rad - aspect, math.tau)) < _SAME_ASPECT_RAD
                 for e in views.values()
             ):
-                self.reset()
+                self.reset(keep=("track", "target", "reduced"))
             self.sets[name][stamp] = entry
             self._tell({"type": "view", "set": name, "view": entry.as_json()})
 
@@ -255,7 +255,8 @@ class ViewStore:
         """Return a view's picture, as ``jpg`` or ``png``."""
         entry = self.entry(name, stamp_ns)
         return self._cached_bytes(
-            (name, str(stamp_ns), entry.revision, kind), lambda: codes.picture(entry.load(), kind)
+            (name, str(stamp_ns), entry.revision, kind),
+            lambda: codes.picture(codes.shown(entry.load(), SETS[name]), kind),
         )
 
     def composite_picture(self, name: str) -> bytes:

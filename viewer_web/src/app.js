@@ -18,14 +18,21 @@ class App {
     this.stats = { drawn: 0, events: [], latency: [], surfaces: [], first: 0 };
     this.loader = new Loader(content?.files, () => this.dirty());
     this.panels = [new Panel($("panel-a"), this, this.state.layers[0], "Left"), new Panel($("panel-b"), this, this.state.layers[1], "Right")];
-    this.solid = new Solid($("gl"), $("stage-note"), this);
     this.startWorker(content?.files);
+    // The first picture goes before the first object.
+    setTimeout(() => this.startSolid(), 1500);
     this.controls();
     if (content) {
       $("link").textContent = "saved file";
       $("save-html").hidden = true;
       this.all(content.scene);
     } else this.connect();
+  }
+
+  startSolid() {
+    if (this.solid) return;
+    this.solid = new Solid($("gl"), $("stage-note"), this);
+    for (const name of ["track", "target", "volumes"]) this.part(name);
   }
 
   // The run, as the server tells it
@@ -90,9 +97,9 @@ class App {
 
   part(name) {
     if (name === "track" || name === "target") {
-      this.solid.surroundings();
-      if (name === "target" && this.scene.target && !this.looked) { this.looked = true; this.solid.whole(false); }
-    } else if (name === "volumes") for (const each of Object.keys(this.scene.volumes)) this.fetchVolume(each);
+      this.solid?.surroundings();
+      if (this.solid && name === "target" && this.scene.target && !this.looked) { this.looked = true; this.solid.whole(false); }
+    } else if (name === "volumes" && this.solid) for (const each of Object.keys(this.scene.volumes)) this.fetchVolume(each);
     else if (name === "dimensions" || name === "truth") this.dimensions();
     if (name === "track" || name === "pictures") this.refetch();
   }
@@ -225,7 +232,7 @@ class App {
     for (const p of this.panels) p.draw();
     this.prefetch();
     const view = this.current;
-    this.solid.sonar(view);
+    this.solid?.sonar(view);
     if (view) {
       const bearing = (450 - view.aspect_deg) % 360, t = new Date(Number(BigInt(view.stamp) / 1000000n)).toISOString().slice(0, 23).replace("T", " ");
       $("where").textContent = `aspect ${view.aspect_deg.toFixed(1)}° · sonar bears ${bearing.toFixed(1).padStart(5, "0")}° · ${t}Z`;
@@ -233,7 +240,7 @@ class App {
     if (this.state.ruler) $("measured").textContent = this.measured();
     const shown = this.panels.map((p) => p.found?.about?.stamp ?? "").join();
     const all = this.panels.every((p) => p.found?.bitmap), late = this.panels.some((p) => p.found?.late);
-    if (all && !this.stats.first) this.stats.first = performance.now();
+    if (all && !this.stats.first) { this.stats.first = performance.now(); setTimeout(() => this.startSolid(), 50); }
     if (shown !== this.stats.shown && all) { this.stats.drawn++; this.stats.shown = shown; }
     if (this.stats.pending !== undefined && all && !late) {
       this.stats.latency.push(performance.now() - this.stats.pending);
@@ -298,8 +305,9 @@ class App {
     row.querySelector("output").textContent = value < 0.1 ? value.toFixed(4) : value.toFixed(3);
     this.surface(name, code, performance.now());
     if (this.state.evidence && this.volumes[name]) this.solid.evidence(name, this.volumes[name], Math.min(254, code * 1.25));
+    if (name !== "main" || this.loader.files) return;
     clearTimeout(this.exact);
-    if (name === "main" && !this.loader.files) this.exact = setTimeout(() => this.measureAt(value), 300);
+    this.exact = setTimeout(() => this.measureAt(value), 300);
   }
 
   surface(name, code, asked) {
@@ -357,13 +365,13 @@ class App {
 
   controls() {
     const s = this.state, press = (id, work) => ($(id).onclick = work);
-    const check = (id, work) => { $(id).checked = s[id]; $(id).onchange = () => { s[id] = $(id).checked; work?.(); this.save(); this.dirty(); this.solid.dirty(); }; };
+    const check = (id, work) => { $(id).checked = s[id]; $(id).onchange = () => { s[id] = $(id).checked; work?.(); this.save(); this.dirty(); this.solid?.dirty(); }; };
     check("contour");
     check("cast");
     check("compare", () => ($("tag-other").hidden = !s.compare));
     check("evidence", () => { if (s.evidence) for (const n of Object.keys(this.volumes)) this.threshold(n, +$(`threshold-${n}`).value); });
     $("tag-other").hidden = !s.compare;
-    $("whole").onchange = () => this.solid.whole($("whole").checked);
+    $("whole").onchange = () => this.solid?.whole($("whole").checked);
     press("play", () => this.play());
     press("orientation", () => this.turn());
     press("ruler", () => this.rule());

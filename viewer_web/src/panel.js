@@ -185,9 +185,9 @@ export class Panel {
     onto(mask.A);
     g.beginPath();
     for (const line of lines) {
-      for (let i = 0; i < line.length; i += 2) g.lineTo(line[i], line[i + 1]);
+      g.moveTo(line[0], line[1]);
+      for (let i = 2; i < line.length; i += 2) g.lineTo(line[i], line[i + 1]);
       g.closePath();
-      if (lines.length > 1) g.moveTo(NaN, NaN);
     }
     this.stroke(g, "#ffb347", 1.6);
   }

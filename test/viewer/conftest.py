@@ -1,0 +1,118 @@
+"""Fixtures of the viewer's tests: a browser, a page that is watched, and a finished run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlparse
+
+import pytest
+
+from csas_shadow_ros.cli import main
+from csas_shadow_ros.viewer.server import ViewerServer
+from csas_shadow_ros.viewer.source import PathSource
+from csas_shadow_ros.viewer.store import ViewStore
+
+CHROMIUM = os.environ.get("CSAS_CHROMIUM", shutil.which("chromium") or "")
+ARGUMENTS = [
+    "--no-sandbox",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+
+
+class Watched:
+    """A page, with what it said and asked for."""
+
+    def __init__(self, page: Any) -> None:
+        self.page = page
+        self.said: list[str] = []
+        self.asked: list[str] = []
+        page.on("console", lambda m: self.said.append(m.text) if m.type in ("error", "warning") else None)
+        page.on("pageerror", lambda e: self.said.append(str(e)))
+        page.on("request", lambda r: self.asked.append(r.url))
+
+    def js(self, text: str) -> Any:
+        return self.page.evaluate(text)
+
+    def until(self, text: str, timeout_s: float = 20.0) -> Any:
+        """Wait until an expression is true (by the debugger: the page itself forbids eval)."""
+        end = time.monotonic() + timeout_s
+        while not (value := self.js(text)):
+            assert time.monotonic() < end, f"not within {timeout_s} s: {text}"
+            time.sleep(0.03)
+        return value
+
+    def open(self, url: str) -> Watched:
+        self.page.goto(url)
+        self.until("window.csas && csas.stats.first > 0 && csas.solid")
+        return self
+
+    def settle(self) -> None:
+        """Wait until both pictures show the wanted view, exactly."""
+        self.until("!csas.scrubbing() && !csas.frame && csas.panels.every(p => p.found?.bitmap && p.found.exact)")
+
+    def strangers(self) -> list[str]:
+        """Return the addresses asked for that are not of this machine."""
+        local = ("localhost", "127.0.0.1", "")
+        return [a for a in self.asked if (urlparse(a).hostname or "") not in local]
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    if not CHROMIUM:
+        pytest.skip("no chromium: apt-get install chromium (or name one in CSAS_CHROMIUM)")
+    sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
+    with sync_api.sync_playwright() as playwright:
+        made = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield made
+        made.close()
+
+
+@pytest.fixture
+def watched(browser: Any) -> Iterator[Watched]:
+    context = browser.new_context(viewport={"width": 1366, "height": 768}, accept_downloads=True)
+    page = Watched(context.new_page())
+    yield page
+    context.close()
+    assert page.said == [], "the console is clean"
+    assert page.strangers() == [], "no request leaves the machine"
+
+
+@pytest.fixture(scope="session")
+def results(tmp_path_factory: pytest.TempPathFactory, tiny_box_bag: Any) -> Path:
+    """A finished run with 72 views, as `csas-shadow run` leaves it."""
+    out = tmp_path_factory.mktemp("viewed") / "run"
+    given = [str(tiny_box_bag.path), "--out", str(out), "--step-deg", "5", "--no-figures", "-q"]
+    assert main(["run", *given, "--voxel-size-m", "0.04"]) == 0
+    return out
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[[ViewStore], str]]:
+    servers: list[ViewerServer] = []
+
+    def start(store: ViewStore, **options: Any) -> str:
+        server = ViewerServer(store, **options)
+        server.start()
+        servers.append(server)
+        return server.url
+
+    yield start
+    for server in servers:
+        server.stop()
+
+
+@pytest.fixture(scope="session")
+def run_store(results: Path) -> ViewStore:
+    store = ViewStore()
+    source = PathSource(store, results)
+    source.start()
+    assert source.done.wait(60)
+    return store
