@@ -34,9 +34,14 @@ class Watched:
         self.page = page
         self.said: list[str] = []
         self.asked: list[str] = []
-        page.on("console", lambda m: self.said.append(m.text) if m.type in ("error", "warning") else None)
+        page.on("console", self._on_console)
         page.on("pageerror", lambda e: self.said.append(str(e)))
         page.on("request", lambda r: self.asked.append(r.url))
+
+    def _on_console(self, message: Any) -> None:
+        # The tests' own reading of pixels is no fault of the page.
+        if message.type in ("error", "warning") and "willReadFrequently" not in message.text:
+            self.said.append(message.text)
 
     def js(self, text: str) -> Any:
         return self.page.evaluate(text)
@@ -76,7 +81,7 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture
-def watched(browser: Any) -> Iterator[Watched]:
+def watched(browser: Any, serve: Any) -> Iterator[Watched]:  # serve: its servers end after the page
     context = browser.new_context(viewport={"width": 1366, "height": 768}, accept_downloads=True)
     page = Watched(context.new_page())
     yield page

@@ -51,6 +51,7 @@ class App {
   linked(on) {
     $("link").textContent = on ? (this.scene.live ? "live" : "connected") : "viewer is away: waiting for it";
     $("link").classList.toggle("on", on);
+    this.loader.paused = !on;
   }
 
   notice(n) {

@@ -58,9 +58,9 @@ export class Loader {
       if (this.bitmaps.has(a) || this.busy.has(a)) continue;
       if (this.blobs.has(a)) {
         if (this.running("decode") < DECODES) this.decode(a);
-      } else if (this.running("fetch") < FETCHES) this.fetch(a);
+      } else if (!this.paused && this.running("fetch") < FETCHES) this.fetch(a);
     }
-    while (this.all.length && this.running("fetch") < FETCHES - 1) {
+    while (!this.paused && this.all.length && this.running("fetch") < FETCHES - 1) {
       const a = this.all.shift();
       if (!this.blobs.has(a) && !this.busy.has(a)) this.fetch(a);
     }
