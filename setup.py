@@ -44,7 +44,9 @@ CORE = [
 # ROS 2 Jazzy from PyPI, in versions that were tried together. Where ROS 2 is installed by other means
 # (apt, conda, source) this extra is not needed and would be in the way.
 ROS = ["ros-rclpy==7.1.6", "ros-rmw-fastrtps-cpp==8.4.3", "ros-common-interfaces==5.3.6"]
-TEST = ["pytest>=8", "pytest-xdist>=3.5", "hypothesis>=6.100", "playwright>=1.49,<2", "ruff~=0.17.6", "mypy~=2.4.1"]
+TEST = ["pytest>=8", "pytest-xdist>=3.5", "hypothesis>=6.100", "ruff~=0.17.6", "mypy~=2.4.1"]
+# The viewer's page is tested in Debian's chromium; no browser is downloaded.
+TEST += ["playwright>=1.49,<2"]
 # setuptools 80 dropped what colcon's --symlink-install calls.
 BUILD = ["colcon-common-extensions>=0.3", "setuptools>=68,<80"]
 

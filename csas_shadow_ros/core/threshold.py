@@ -172,8 +172,8 @@ def needed_threshold(
 ) -> NDArray[np.float32]:
     """Return what the threshold must be over for a voxel to be object, stray pieces included.
 
-    ``needed_threshold(…) < t`` is the body of `occupied_voxels` at t before the small pieces are left out, for
-    every t at once: what a threshold that is moved by hand works on.
+    ``needed_threshold(…) < t`` is the body of `occupied_voxels` at t before the small pieces are left
+    out, for every t at once: what a threshold that is moved by hand works on.
 
     Parameters
     ----------

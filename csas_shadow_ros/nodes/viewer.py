@@ -1,8 +1,8 @@
 """Node `viewer`: the operator's view of the live graph, in a browser (figures 2, 3, 5, 6 and 8).
 
-It only looks: it sends no heartbeat and no reports, so no source waits for it, and what it is too slow for it drops.
-When a source says that it has finished, the node joins as a sink for as long as it lacks views (dropped ones, or
-those of before it was started), gets them by flow control, and says goodbye.
+It only looks: it sends no heartbeat and no reports, so no source waits for it, and what it is too slow for it
+drops. When a source says that it has finished, the node joins as a sink for as long as it lacks views (dropped
+ones, or those of before it was started), gets them by flow control, and says goodbye.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class ViewerNode(CsasNode):
         for name in _GROWING:
             self._pair(name, latched=True)
         self.subscribe_latched("track", self._take_track)
-        self.subscribe_latched("target", lambda msg: self.store.put_part("target", box_json(target_from_msg(msg))))
+        self.subscribe_latched("target", self._take_target)
         for topic in ("image", "camera_info"):
             self.subscribe_latched(topic, lambda cdr, topic=topic: self._take_image(topic, cdr), raw=True)
         self.follow_sources()
@@ -157,6 +157,9 @@ class ViewerNode(CsasNode):
                 self._caught_up.clear()
         self.store.put_track(track)
         self._offer_reduced()
+
+    def _take_target(self, msg: Any) -> None:
+        self.store.put_part("target", box_json(target_from_msg(msg)))
 
     def _take_image(self, topic: str, cdr: bytes) -> None:
         self._image[topic] = cdr

@@ -214,7 +214,8 @@ class PathSource:
         held = [s for s in VIEW_STREAMS if (t := self._reader.topic(STREAMS[s].image_topic)) and t.count]
         if not held:
             raise ViewerError(
-                f"{path} holds no views ({', '.join(VIEW_STREAMS)}); make them: csas-shadow run {path} --out DIR"
+                f"{path} holds no views ({', '.join(VIEW_STREAMS)});"
+                f" make them: csas-shadow run {path} --out DIR"
             )
         self._held = held
 

@@ -84,7 +84,8 @@ class Spool:
     """Keeps codes on disk, compressed: memory does not grow with the number of views."""
 
     def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile(prefix="csas_viewer_")  # noqa: SIM115: open as long as the spool
+        # Open as long as the spool.
+        self._file = tempfile.TemporaryFile(prefix="csas_viewer_")  # noqa: SIM115
         self._lock = threading.Lock()
         self._end = 0
 
@@ -287,7 +288,7 @@ class ViewStore:
 
 
 def volume_codes(needed: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Code the threshold that a voxel needs to be object: 254 times its root (fine where small); 255 never."""
+    """Code the threshold that a voxel needs to be object: 254 times its root; 255 never."""
     finite = np.isfinite(needed)
     code = np.rint(254.0 * np.sqrt(np.where(finite, np.clip(needed, 0.0, 1.0), 0.0)))
     return np.where(finite, code, 255).astype(np.uint8)

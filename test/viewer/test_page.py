@@ -1,3 +1,5 @@
+# What is asked of the page is JavaScript, and stays in one piece.
+# ruff: noqa: E501
 """The page in a browser: every interaction, on views that tell which they are and on a real run."""
 
 from __future__ import annotations
@@ -123,7 +125,7 @@ def test_views_that_have_not_arrived_are_a_gap_that_a_live_run_fills(watched, se
 
     def bright(aspect: float) -> bool:
         k = f"csas.panels[1].slider, a = {math.radians(aspect)}, c = s.ring, f = c.width / s.side"
-        pixel = f"c.width / 2 + f * s.radius * Math.cos(a), c.width / 2 - f * s.radius * Math.sin(a), 1, 1"
+        pixel = "c.width / 2 + f * s.radius * Math.cos(a), c.width / 2 - f * s.radius * Math.sin(a), 1, 1"
         return watched.js(f"(() => {{ const s = {k}; return c.getContext('2d').getImageData({pixel}).data[0]; }})()") > 100
 
     watched.settle()
@@ -269,7 +271,7 @@ def test_the_surface_follows_the_threshold_and_stays_near_the_measured_one(watch
     assert colours > 20, "the 3-D picture is not blank"
 
 
-def test_soft_and_hard_stand_side_by_side_with_evidence_track_and_uncertain_dimensions(watched, serve, run_store):
+def test_soft_and_hard_stand_side_by_side_with_evidence_track_and_dimensions(watched, serve, run_store):
     watched.open(serve(run_store))
     watched.until("csas.solid.sides.other.triangles > 0")
     page = watched.page

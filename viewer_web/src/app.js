@@ -92,7 +92,7 @@ class App {
       const there = new Set(scene.sets[name]?.views.map((v) => v.stamp));
       const same = scene.sets[name]?.views.some((v) => set.views.some((o) => o.stamp === v.stamp)) || !there.size;
       if (!same) continue;
-      for (const v of set.views) if (!there.has(v.stamp) && this.loader.blobs.has(this.address(name, v, "jpg"))) scene.sets[name].views.push(v);
+      for (const v of set.views) if (!there.has(v.stamp) && this.loader.blobs.has(this.address(name, v, "jpg"))) scene.sets[name].views.push({ ...v, kept: true });
     }
   }
 
@@ -159,7 +159,7 @@ class App {
     const wanted = [], ahead = Math.sign(this.velocity || 1), rest = !this.scrubbing() && !this.playing;
     for (const p of this.panels) {
       if (p.found?.wanted) wanted.push(p.found.wanted);
-      if (rest && p.isView && p.found?.about && !this.loader.files) wanted.push(this.address(p.layer, p.found.about, "png"));
+      if (rest && p.isView && p.found?.about && !p.found.about.kept && !this.loader.files) wanted.push(this.address(p.layer, p.found.about, "png"));
     }
     for (let i = 1; i <= 6; i++)
       for (const p of this.panels) {
