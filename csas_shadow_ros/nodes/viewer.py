@@ -1,8 +1,8 @@
 """Node `viewer`: the operator's view of the live graph, in a browser (figures 2, 3, 5, 6 and 8).
 
 It only looks: it sends no heartbeat and no reports, so no source waits for it, and what it is too slow for it
-drops. When a source says that it has finished, the node joins as a sink for as long as it lacks views (dropped
-ones, or those of before it was started), gets them by flow control, and says goodbye.
+drops. When a source says that it has finished, the node joins as a sink for as long as it lacks views (those
+dropped, or sent before it was started), gets them by flow control, and says goodbye.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import queue
 import sys
 import threading
 import time
+from functools import partial
 from typing import Any
 
 from csas_shadow_ros.bags.bag import BagMessage
@@ -98,7 +99,7 @@ class ViewerNode(CsasNode):
         self.subscribe_latched("track", self._take_track)
         self.subscribe_latched("target", self._take_target)
         for topic in ("image", "camera_info"):
-            self.subscribe_latched(topic, lambda cdr, topic=topic: self._take_image(topic, cdr), raw=True)
+            self.subscribe_latched(topic, partial(self._take_image, topic), raw=True)
         self.follow_sources()
 
     def forget(self) -> None:

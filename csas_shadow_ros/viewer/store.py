@@ -6,6 +6,7 @@ import math
 import tempfile
 import threading
 import uuid
+import weakref
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
@@ -86,6 +87,7 @@ class Spool:
     def __init__(self) -> None:
         # Open as long as the spool.
         self._file = tempfile.TemporaryFile(prefix="csas_viewer_")  # noqa: SIM115
+        weakref.finalize(self, self._file.close)
         self._lock = threading.Lock()
         self._end = 0
 

@@ -93,7 +93,8 @@ class Viewer:
     def until(self, condition: Callable[[], Any], what: str, timeout_s: float = 60.0) -> None:
         end = time.monotonic() + timeout_s
         while not condition():
-            assert time.monotonic() < end, f"{what}: {self.state()}\n{(self.folder / 'viewer.log').read_text()}"
+            log = (self.folder / "viewer.log").read_text()
+            assert time.monotonic() < end, f"{what}: {self.state()}\n{log}"
             time.sleep(0.1)
 
     def has_all(self) -> bool:
