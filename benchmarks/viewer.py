@@ -132,7 +132,8 @@ def measure(store: ViewStore, *, threshold: bool) -> dict[str, Any]:
 
 def main() -> int:
     """Measure and print JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    layout = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
     parser.add_argument("--results", type=Path, help="a results folder to open as well")
     arguments = parser.parse_args()
     report: dict[str, Any] = {"cores": os.cpu_count(), "load": round(os.getloadavg()[0], 2)}

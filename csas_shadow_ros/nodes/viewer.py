@@ -87,6 +87,7 @@ class ViewerNode(CsasNode):
         self._image: dict[str, bytes] = {}
         self._finished = False
         self._said_s = 0.0
+        self._joined = ""
         self._caught_up: dict[str, int] = {}
         self._shaped = threading.Event()
         self._stopping = threading.Event()
@@ -231,6 +232,8 @@ class ViewerNode(CsasNode):
         own = beat.values.get("stream", "")
         if own == "sector" or self.server is None:
             return
+        if self.inlets and beat.instance != self._joined:
+            self._leave()  # another run has begun: whatever the last one lacked is not to be had any more
         if self.inlets:
             done = beat.values.get("finished_for", "").split()
             if all(inlet.instance in done for inlet in self.inlets):
@@ -246,9 +249,10 @@ class ViewerNode(CsasNode):
         fed = [s for s in fed if self.count_publishers(stream_of(s).image_topic)]
         lacking = any(len(self.store.sets[s]) < total for s in fed)
         if finished and lacking and self._caught_up.get(beat.instance) != total and self._queue.empty():
-            self._join(fed)
+            self._join(fed, beat.instance)
 
-    def _join(self, streams: list[str]) -> None:
+    def _join(self, streams: list[str], source: str) -> None:
+        self._joined = source
         joined = [CatchingUp(self, s) for s in streams]
         for inlet in joined:
             for stamp in list(self.store.sets[inlet.stream]):

@@ -136,8 +136,9 @@ def test_a_page_fills_from_the_live_graph_and_outlives_the_viewer_and_the_graph(
     page.js("csas.setAspect(90)")
     page.until("csas.current.aspect_deg === 90 && csas.panels.every(p => p.found?.bitmap && !p.found.late)")
     with Graph(plan(run_bag), viewer.domain, tmp_path):
-        page.until("csas.scene.status.includes('running')", 30)
-        page.until("csas.scene.status.includes('finished')", 60)
+        viewer.until(lambda: "running" in viewer.state(), "the graph that came back is followed")
+        viewer.until(lambda: "finished" in viewer.state(), "and its end is seen")
+        page.until("csas.scene.status.includes('finished')")
     assert page.js(f"csas.views('shadow').length === {VIEWS}")
     assert page.js("window.mark") == 1, "the page was never loaded again"
     assert page.strangers() == []

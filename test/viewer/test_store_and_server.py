@@ -22,7 +22,8 @@ def get(url: str, **headers: str) -> tuple[int, bytes]:
         with urllib.request.urlopen(request, timeout=10) as answer:
             return answer.status, answer.read()
     except urllib.error.HTTPError as error:
-        return error.code, error.read()
+        with error:
+            return error.code, error.read()
 
 
 def test_codes_are_levels_over_the_median_to_half_a_step() -> None:

@@ -185,6 +185,7 @@ class App {
     const turn = ((aspect - this.state.aspect + 540) % 360) - 180;
     this.velocity = turn;
     this.state.aspect = aspect;
+    for (const p of this.panels) p.slider.aspect = aspect;
     this.moved = performance.now();
     this.stats.pending = when;
     clearTimeout(this.rest);

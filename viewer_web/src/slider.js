@@ -86,7 +86,9 @@ export class CsasSlider extends HTMLElement {
 
   move(by, when) {
     const n = this.aspects.length;
-    if (n) this.choose((((this.index + by) % n) + n) % n, when);
+    // Two keys may come between two drawings: the step goes from what was chosen, not from what is drawn.
+    const at = this.aspect === undefined ? this.index : this.nearest(this.aspect);
+    if (n) this.choose((((at + by) % n) + n) % n, when);
   }
 
   choose(index, when = performance.now()) {
