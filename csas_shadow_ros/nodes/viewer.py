@@ -16,6 +16,8 @@ import time
 from functools import partial
 from typing import Any
 
+from rclpy.duration import Duration
+
 from csas_shadow_ros.bags.bag import BagMessage
 from csas_shadow_ros.core.errors import CsasError
 from csas_shadow_ros.core.parameters import CarvingParameters, SubApertureParameters
@@ -261,9 +263,18 @@ class ViewerNode(CsasNode):
         self.get_logger().info("the run is finished: asking for the views that were missed")
 
     def _leave(self) -> None:
-        for inlet in self.inlets:
-            self._heartbeats.publish(progress_to_msg(self.messages, inlet.beat(leaving=True)))
-        self.inlets.clear()
+        """Say goodbye, and take the kept reports back: a later source would wait for who sent them."""
+        with self._beat_lock:
+            for inlet in self.inlets:
+                self._heartbeats.publish(progress_to_msg(self.messages, inlet.beat(leaving=True)))
+                self._heartbeats.wait_for_all_acked(Duration(seconds=0.2))
+            self.inlets.clear()
+            old = (self._reports, self._heartbeats)
+            self._owned = [(destroy, made) for destroy, made in self._owned if made not in old]
+            for made in old:
+                self.destroy_publisher(made)
+            self._reports = self.publisher("progress", qos.REPORTS)
+            self._heartbeats = self.publisher("progress", qos.HEARTBEAT)
         self._shaped.clear()
         self._finished = True
 

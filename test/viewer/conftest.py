@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,9 @@ def watched(browser: Any, serve: Any) -> Iterator[Watched]:  # serve: its server
 
 @pytest.fixture(scope="session")
 def results(tmp_path_factory: pytest.TempPathFactory, tiny_box_bag: Any) -> Path:
-    """A finished run with 72 views, as `csas-shadow run` leaves it."""
+    """A finished run with 72 views, as `csas-shadow run` leaves it; for screenshots, that of CSAS_VIEWED."""
+    if viewed := os.environ.get("CSAS_VIEWED"):
+        return Path(viewed)
     out = tmp_path_factory.mktemp("viewed") / "run"
     given = [str(tiny_box_bag.path), "--out", str(out), "--step-deg", "5", "--no-figures", "-q"]
     assert main(["run", *given, "--voxel-size-m", "0.04"]) == 0
