@@ -48,6 +48,8 @@ from .flow import place_of
 _BACKLOG = 32
 _GROWING = ("multilook", "color_by_aspect", "voxel_grid", "voxel_views")
 _BATCH = 8
+#: Discovery takes a moment after the start and after leaving; so often a run's missing views are asked for.
+_SETTLE_S, _TRIES = 3.0, 3
 
 
 class CatchingUp(Inlet):
@@ -90,7 +92,8 @@ class ViewerNode(CsasNode):
         self._finished = False
         self._said_s = 0.0
         self._joined = ""
-        self._caught_up: dict[str, int] = {}
+        self._tries: dict[tuple[str, int], int] = {}
+        self._since_s = time.monotonic()
         self._shaped = threading.Event()
         self._stopping = threading.Event()
         self._worker = threading.Thread(target=self._work, name="viewer-worker", daemon=True)
@@ -158,7 +161,7 @@ class ViewerNode(CsasNode):
             n = min(len(before), len(track))
             if (before.stamps_ns[:n] != track.stamps_ns[:n]).any():
                 self.store.reset()
-                self._caught_up.clear()
+                self._tries.clear()
         self.store.put_track(track)
         self._offer_reduced()
 
@@ -240,7 +243,6 @@ class ViewerNode(CsasNode):
             done = beat.values.get("finished_for", "").split()
             if all(inlet.instance in done for inlet in self.inlets):
                 self._leave()
-                self._caught_up[beat.instance] = beat.counts.get("total", 0)
             return
         finished, total = bool(beat.counts.get("finished")), beat.counts.get("total", 0)
         if finished != self._finished:
@@ -250,7 +252,11 @@ class ViewerNode(CsasNode):
         # A stream that nobody publishes cannot be caught up with.
         fed = [s for s in fed if self.count_publishers(stream_of(s).image_topic)]
         lacking = any(len(self.store.sets[s]) < total for s in fed)
-        if finished and lacking and self._caught_up.get(beat.instance) != total and self._queue.empty():
+        # Not before everybody has been heard of, nor for ever: a view that a stage refuses is never to be had.
+        settled = time.monotonic() - self._since_s > _SETTLE_S and self._queue.empty()
+        tries = self._tries.get((beat.instance, total), 0)
+        if finished and lacking and settled and tries < _TRIES:
+            self._tries[beat.instance, total] = tries + 1
             self._join(fed, beat.instance)
 
     def _join(self, streams: list[str], source: str) -> None:
@@ -275,6 +281,7 @@ class ViewerNode(CsasNode):
                 self.destroy_publisher(made)
             self._reports = self.publisher("progress", qos.REPORTS)
             self._heartbeats = self.publisher("progress", qos.HEARTBEAT)
+        self._since_s = time.monotonic()
         self._shaped.clear()
         self._finished = True
 
