@@ -16,6 +16,7 @@ NODES = (
     "composites",
     "bag_player",
     "bag_recorder",
+    "viewer",
 )
 
 CORE = [
@@ -36,11 +37,16 @@ CORE = [
     "rosbags>=0.11,<0.12",
     # Ray casting of simulated scenes; an x86-64 and arm64 wheel exists for every supported Python.
     "embreex>=2.17.7",
+    # The operator's view: its server, and pictures of views.
+    "aiohttp>=3.10,<4",
+    "pillow>=10.1",
 ]
 # ROS 2 Jazzy from PyPI, in versions that were tried together. Where ROS 2 is installed by other means
 # (apt, conda, source) this extra is not needed and would be in the way.
 ROS = ["ros-rclpy==7.1.6", "ros-rmw-fastrtps-cpp==8.4.3", "ros-common-interfaces==5.3.6"]
 TEST = ["pytest>=8", "pytest-xdist>=3.5", "hypothesis>=6.100", "ruff~=0.17.6", "mypy~=2.4.1"]
+# The viewer's page is tested in Debian's chromium; no browser is downloaded.
+TEST += ["playwright>=1.49,<2"]
 # The benchmark compares with the fastest FFT library that can be had: a floor to measure against.
 BENCH = ["pyfftw>=0.14"]
 # setuptools 80 dropped what colcon's --symlink-install calls.

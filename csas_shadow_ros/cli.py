@@ -1,4 +1,4 @@
-"""The command line: ``csas-shadow simulate | check | info | run | replay``."""
+"""The command line: ``csas-shadow simulate | check | info | run | replay | view``."""
 
 from __future__ import annotations
 
@@ -214,6 +214,7 @@ def build_parser() -> argparse.ArgumentParser:
     _common(info)
     _add_run(add)
     _add_replay(add)
+    _add_view(add)
     return parser
 
 
@@ -432,6 +433,29 @@ def _add_replay(add: Callable[..., argparse.ArgumentParser]) -> None:
     _common(p)
 
 
+def _add_view(add: Callable[..., argparse.ArgumentParser]) -> None:
+    p = add(
+        "view",
+        "look at a results folder or a bag in a browser: circular sliders, layers, ruler, 3-D",
+        "  csas-shadow view box_results\n"
+        "  csas-shadow view box_results/result.mcap --no-browser --port 8765\n"
+        "  csas-shadow view box_results --html box.html --every 5\n\n"
+        "ends with Ctrl-C. Listens on this machine alone unless --host says otherwise; the network is asked\n"
+        "for the token that is then printed. For a live graph: ros2 run csas_shadow_ros viewer",
+        _view,
+    )
+    p.add_argument("path", metavar="DIR|BAG", help="a results folder, or a bag that holds views")
+    p.add_argument("--host", default="127.0.0.1", help="address to listen at (default 127.0.0.1)")
+    p.add_argument("--port", type=int, default=0, metavar="N", help="port (default: any that is free)")
+    p.add_argument("--token", help="token to ask for (default: none here, a new one on a network)")
+    p.add_argument("--no-browser", action="store_true", help="only print the address")
+    p.add_argument("--html", metavar="FILE", help="write one HTML file that opens without a server, and end")
+    p.add_argument(
+        "--every", type=int, default=2, metavar="N", help="of that file: every N-th view (default 2)"
+    )
+    _common(p)
+
+
 # -- commands ---------------------------------------------------------------------------------------
 
 
@@ -515,6 +539,31 @@ def _check(arguments: argparse.Namespace, console: Console) -> int:
     report = check_bag(arguments.bag, arguments.namespace)
     console.result(str(report), report.as_dict())
     return OK if report.ok else FAILED
+
+
+def _view(arguments: argparse.Namespace, console: Console) -> int:
+    from .viewer import command
+
+    if arguments.html is not None:
+        if not 1 <= arguments.every <= 360:
+            raise ParameterError(f"--every is {arguments.every}; expected 1 to 360")
+        size = command.save_html(arguments.path, arguments.html, arguments.every)
+        console.result(f"{arguments.html}: {_size(size)}", {"file": arguments.html, "bytes": size})
+        return OK
+
+    def say(url: str) -> None:
+        console.result(url, {"url": url})
+        sys.stdout.flush()
+
+    command.view(
+        arguments.path,
+        host=arguments.host,
+        port=arguments.port,
+        token=arguments.token,
+        browser=not arguments.no_browser,
+        say=say,
+    )
+    return OK
 
 
 def _info(arguments: argparse.Namespace, console: Console) -> int:

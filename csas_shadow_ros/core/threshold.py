@@ -165,3 +165,37 @@ def thresholded(
         well_seen = views >= max(1, math.ceil(parameters.min_views_fraction * int(views.max(initial=0))))
     occupied = occupied_voxels(likelihood, threshold, method, well_seen)
     return VoxelGrid(volume, likelihood, views, threshold, occupied, method)
+
+
+def needed_threshold(
+    likelihood: NDArray[np.float32], method: str, well_seen: NDArray[np.bool_] | None = None
+) -> NDArray[np.float32]:
+    """Return what the threshold must be over for a voxel to be object, stray pieces included.
+
+    ``needed_threshold(…) < t`` is the body of `occupied_voxels` at t before the small pieces are left
+    out, for every t at once: what a threshold that is moved by hand works on.
+
+    Parameters
+    ----------
+    likelihood, method, well_seen
+        As of `occupied_voxels`.
+
+    Returns
+    -------
+    ndarray of float32, shape (nz, ny, nx)
+        Infinite where no threshold makes the voxel object.
+    """
+    never = np.float32(np.inf)
+    trusted = likelihood if well_seen is None else np.where(well_seen, likelihood, np.float32(np.nan))
+    out = np.where(np.isnan(trusted), never, trusted)
+    support = np.float32(_SOFT_SUPPORT if method == "soft" else 0.0)
+    for k in range(out.shape[0] - 2, -1, -1):
+        with np.errstate(invalid="ignore"):
+            open_to = np.isnan(trusted[k]) | (trusted[k] < support)
+        out[k] = np.where(open_to, np.minimum(out[k], out[k + 1]), out[k])
+    if well_seen is not None:
+        for k in range(1, out.shape[0]):
+            own = np.where(np.isnan(likelihood[k]), never, likelihood[k])
+            standing = np.maximum(own, out[k - 1])
+            out[k] = np.where(well_seen[k], out[k], np.minimum(out[k], standing))
+    return np.asarray(out, dtype=np.float32)

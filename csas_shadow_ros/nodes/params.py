@@ -143,6 +143,18 @@ class BagRecorderNodeParameters(NodeParameters):
     topics: str = bounded("all", "topics to record, relative, separated by commas; all: the whole contract")
 
 
+@dataclass(frozen=True)
+class ViewerNodeParameters(NodeParameters):
+    """Parameters of `viewer`."""
+
+    host: str = bounded("127.0.0.1", "address to listen at; not a loopback one: a token is asked for")
+    port: int = bounded(8765, "port of the page; 0: any that is free", low=0, high=65535)
+    token: str = bounded("auto", "token to ask for; auto: none on this machine, a new one on a network")
+    method: str = bounded(
+        "consensus", "method of voxel_carver, whose grid is shown", choices=("consensus", "hard", "soft")
+    )
+
+
 #: The parameters of each node.
 NODES: dict[str, type[Parameters]] = {
     "sub_aperture": SubApertureNodeParameters,
@@ -152,6 +164,7 @@ NODES: dict[str, type[Parameters]] = {
     "composites": CompositesNodeParameters,
     "bag_player": BagPlayerNodeParameters,
     "bag_recorder": BagRecorderNodeParameters,
+    "viewer": ViewerNodeParameters,
 }
 
 #: Parameters that may change while the node runs. A change of any other would mix two results in one.

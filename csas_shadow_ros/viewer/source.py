@@ -1,0 +1,334 @@
+"""Feeding the store from a results folder or a bag."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import threading
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msg_adapters.camera_info import view_info_from_msg
+from msg_adapters.image import image_from_msg
+from msg_adapters.pairs import ground_picture_from_msgs, view_from_msgs, voxel_grid_from_msgs
+from msg_adapters.target import TargetBox, target_from_msg
+from msg_adapters.topics import STREAMS, VIEW_STREAMS
+from msg_adapters.track import track_from_msg
+
+from ..bags import BagReader, iterate_pairs, read_run
+from ..bags.run import checked_messages
+from ..core.carving import Carver
+from ..core.errors import BagError, CsasError
+from ..core.geometry import CoherentImage, Track, View
+from ..core.measurement import SilhouetteSides, levels_of_mask, measure_object, silhouette_sides
+from ..core.mesh import mesh_from_grid
+from ..core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
+from ..core.subaperture import SubApertures
+from ..core.threshold import thresholded
+from ..core.volume import Volume, VoxelGrid
+from . import codes
+from .index import BagIndex
+from .store import Entry, Spool, ViewerError, ViewStore
+
+log = logging.getLogger(__name__)
+#: Width of the reduced sub-apertures of figure 5 (deg).
+REDUCED_DEG = 4.0
+RESULT_BAG = "result.mcap"
+
+
+def codes_of(name: str, pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return what of a stream's pixels is shown."""
+    if name == "shadow_mask":
+        return np.ascontiguousarray(pixels)
+    return codes.likelihood_codes(pixels) if name == "likelihood" else codes.amplitude_codes(pixels)
+
+
+def spooled(spool: Spool, name: str, view: View) -> Entry:
+    """Make the entry of a view that came by; its codes are kept on disk."""
+    pixels = codes_of(name, view.pixels)
+    return Entry(view.info, f"{zlib.crc32(pixels.tobytes()):08x}", spool.put(pixels))
+
+
+class Reduced:
+    """Sub-apertures of 4°, made when they are looked at (figure 5a)."""
+
+    def __init__(self, image: CoherentImage, track: Track, p: SubApertureParameters) -> None:
+        self._image, self._track = image, track
+        self._p = replace(p, aperture_deg=min(REDUCED_DEG, p.aperture_deg), spacing_m=0.0)
+
+    def fill(self, store: ViewStore) -> None:
+        """Add one to the store for each sub-aperture view, or shadow view, that is there."""
+        made = SubApertures(self._image, self._track, self._p)
+        for one in list((store.sets["sub_aperture"] or store.sets["shadow"]).values()):
+            aspect = one.info.aspect_rad
+            try:
+                info = made.info(aspect)
+            except CsasError as error:
+                log.info("no reduced view at %.1f deg: %s", math.degrees(aspect), error)
+                continue
+
+            def load(aspect: float = aspect) -> NDArray[np.uint8]:
+                return codes.amplitude_codes(made.view_of_aspect(aspect).pixels)
+
+            # The stamp of the view that it is compared with, to the nanosecond.
+            entry = Entry(replace(info, stamp_ns=one.info.stamp_ns), f"{self._p.aperture_deg:g}", load)
+            store.put_view("reduced", entry)
+
+
+class Shape:
+    """The other method's grid, and dimensions from the silhouettes, as views come in."""
+
+    def __init__(self, store: ViewStore, parameters: CarvingParameters) -> None:
+        self._store = store
+        self.parameters = parameters
+        self._sides: dict[int, SilhouetteSides] = {}
+        self._taken: set[tuple[str, int]] = set()
+        self._other: Carver | None = None
+
+    @property
+    def other_stream(self) -> str:
+        """Which stream the other method takes."""
+        return "shadow_mask" if self.parameters.other().takes_masks else "likelihood"
+
+    def pending(self) -> list[tuple[str, Entry]]:
+        """Return the likelihoods and masks in the store that have not been taken yet."""
+        main = self._store.grids.get("main")
+        if main is None:
+            return []
+        self._on(main.volume)
+        with self._store.lock:
+            return [
+                (name, entry)
+                for name in dict.fromkeys((self.other_stream, "shadow_mask"))
+                for entry in self._store.sets[name].values()
+                if (name, entry.info.stamp_ns) not in self._taken
+            ]
+
+    def _on(self, volume: Volume) -> Carver:
+        if self._other is None or self._other.volume != volume:
+            self._other, self._sides, self._taken = Carver(volume, self.parameters.other()), {}, set()
+        return self._other
+
+    def add(self, name: str, entry: Entry) -> None:
+        """Take one likelihood or mask."""
+        main = self._store.grids.get("main")
+        if main is None:
+            return
+        volume = main.volume
+        other = self._on(volume)
+        self._taken.add((name, entry.info.stamp_ns))
+        pixels: NDArray[Any] = entry.load()
+        if name == "likelihood":
+            pixels = codes.likelihood_of(pixels)
+        view = View(entry.info, pixels)
+        try:
+            if name == self.other_stream:
+                other.integrate(view)
+            if name == "shadow_mask":
+                x, y, _ = volume.centre_m
+                side = silhouette_sides(levels_of_mask(view), view, (x, y))
+                if side is not None:
+                    self._sides[entry.info.stamp_ns] = side
+        except CsasError as error:
+            log.info("%s: %s", name, error)  # the node that made it, or the report, names it too
+
+    def publish(self, *, measure: bool) -> None:
+        """Give the store what there is now."""
+        if self._other is not None and self._other.stamps:
+            self._store.put_grid("other", self._other.grid(), self.parameters.min_views_fraction)
+        main = self._store.grids.get("main")
+        if measure and main is not None and main.occupied.any():
+            found = measure_object(main, mesh_from_grid(main), list(self._sides.values()))
+            self._store.put_dimensions(found)
+
+
+def grid_of(
+    volume: Volume, likelihood: NDArray[np.float32], views: NDArray[Any] | None, p: CarvingParameters
+) -> VoxelGrid:
+    """Make the grid of what came as messages."""
+    if views is None:
+        views = np.where(np.isnan(likelihood), 0, 1)
+    return thresholded(volume, likelihood, views.astype(np.uint16), p)
+
+
+def grid_of_folder(folder: Path, method: str) -> VoxelGrid:
+    """Read ``grid.npz``."""
+    with np.load(folder / "grid.npz") as data:
+        origin = tuple(float(v) for v in data["origin_m"])
+        likelihood = data["likelihood"]
+        volume = Volume((origin[0], origin[1], origin[2]), float(data["voxel_size_m"]), likelihood.shape)
+        threshold = float(data["threshold"])
+        return VoxelGrid(volume, likelihood, data["views"], threshold, data["occupied"], method)
+
+
+def box_json(box: TargetBox | None) -> dict[str, Any] | None:
+    """Return the carved volume's box as the page takes it."""
+    return None if box is None else {"centre": list(box.centre_m), "size": list(box.size_m)}
+
+
+class PathSource:
+    """Feeds a store from a results folder or a bag, first what is seen first.
+
+    Parameters
+    ----------
+    store : ViewStore
+        The store.
+    path : path-like
+        A results folder (with its ``result.mcap`` for the views), or a bag.
+
+    Raises
+    ------
+    ViewerError, BagError
+        If there is nothing to see.
+    """
+
+    def __init__(self, store: ViewStore, path: str | Path) -> None:
+        from ..results.folder import is_results_folder, read_report
+
+        self.store = store
+        path = Path(path)
+        store.title = path.resolve().name
+        self._report: dict[str, Any] = {}
+        self._parameters = PipelineParameters()
+        self._folder: Path | None = None
+        if is_results_folder(path):
+            self._folder, self._report = path, read_report(path)
+            path = path / RESULT_BAG
+            if not path.exists():
+                raise ViewerError(
+                    f"{self._folder} holds no {RESULT_BAG}, so no views; expected a run without --no-bag"
+                )
+            self._use_report()
+        self._bag = path
+        self._reader = BagReader(path)
+        self._spool = Spool()
+        self._thread: threading.Thread | None = None
+        self.done = threading.Event()
+        held = [s for s in VIEW_STREAMS if (t := self._reader.topic(STREAMS[s].image_topic)) and t.count]
+        if not held:
+            raise ViewerError(
+                f"{path} holds no views ({', '.join(VIEW_STREAMS)});"
+                f" make them: csas-shadow run {path} --out DIR"
+            )
+        self._held = held
+
+    def _use_report(self) -> None:
+        p = self._report.get("parameters", {})
+        values = {
+            part.name: type(getattr(self._parameters, part.name)).from_mapping(p.get(part.name, {}))
+            for part in self._parameters.__dataclass_fields__.values()
+            if part.name in p
+        }
+        self._parameters = replace(self._parameters, **values)
+
+    def start(self) -> None:
+        """Register what can be read at once; the rest goes on in a thread."""
+        first = [s for s in ("shadow", "sub_aperture") if s in self._held] or self._held[:1]
+        try:
+            index: BagIndex | None = BagIndex(self._reader)
+        except BagError as error:
+            log.info("%s", error)
+            index = None
+        if index is not None:
+            for name in first:
+                self._register(index, name)
+        self._small_parts()
+        self._thread = threading.Thread(target=self._rest, args=(index, first), name="viewer", daemon=True)
+        self._thread.start()
+
+    def _register(self, index: BagIndex, name: str) -> None:
+        infos = {}
+        for _, message, stamp in checked_messages(self._reader, STREAMS[name].info_topic, lambda _: None):
+            try:
+                infos[stamp] = view_info_from_msg(message, name)
+            except CsasError as error:
+                log.warning("%s: %s", STREAMS[name].info_topic, error)
+        stat = os.stat(self._bag)
+        revision = f"{(stat.st_mtime_ns ^ stat.st_size) & 0xFFFFFFFF:08x}"
+        for stamp, read in sorted(index.places(name, set(infos)).items()):
+
+            def load(read: Callable[[], Any] = read, name: str = name) -> NDArray[np.uint8]:
+                return codes_of(name, image_from_msg(read(), name))
+
+            self.store.put_view(name, Entry(infos[stamp], revision, load))
+
+    def _small_parts(self) -> None:
+        store = self.store
+        if self._report:
+            store.put_dimensions(self._report.get("dimensions"))
+            truth = self._report.get("truth")
+            store.put_part("truth", truth.get("dimensions") if isinstance(truth, dict) else None)
+            store.put_part("status", self._report.get("verdict", ""))
+        for _, message, _ in checked_messages(self._reader, "track", lambda _: None):
+            store.put_track(track_from_msg(message))
+        for _, message, _ in checked_messages(self._reader, "target", lambda _: None):
+            store.put_part("target", box_json(target_from_msg(message)))
+        store.put_part("reduced", bool(self._reader.topic("image") or self._reader.topic("sector/image")))
+        store.make_reduced = self._make_reduced
+
+    def _make_reduced(self) -> None:
+        run = read_run(self._bag)
+        Reduced(run.coherent_image(), run.require_track(), self._parameters.sub_aperture).fill(self.store)
+
+    def _rest(self, index: BagIndex | None, first: list[str]) -> None:
+        try:
+            self._grid()
+            for name in self._held:
+                if index is None:
+                    for view in self._sequential(name):
+                        self.store.put_view(name, spooled(self._spool, name, view))
+                elif name not in first:
+                    self._register(index, name)
+            self._composites()
+            shape = Shape(self.store, replace(self._parameters.carving, threshold=0.0))
+            measure = not self._report
+            for name in ("likelihood", "shadow_mask"):
+                if measure or name == shape.other_stream:
+                    for entry in list(self.store.sets[name].values()):
+                        shape.add(name, entry)
+            shape.publish(measure=measure)
+        except CsasError as error:
+            log.warning("%s", error)
+            self.store.put_part("status", str(error))
+        finally:
+            self.done.set()
+
+    def _sequential(self, name: str) -> Any:
+        for pair in iterate_pairs(self._reader, name, lambda problem: log.warning("%s", problem)):
+            try:
+                yield view_from_msgs(pair.image, pair.info, name)
+            except CsasError as error:
+                log.warning("%s", error)
+
+    def _grid(self) -> None:
+        p = self._parameters.carving
+        if self._folder is not None and (self._folder / "grid.npz").exists():
+            grid = grid_of_folder(self._folder, str(self._report.get("method", p.method)))
+            self.store.put_grid("main", grid, p.min_views_fraction)
+            return
+        found: dict[str, tuple[Volume, NDArray[np.float32]]] = {}
+        for name in ("voxel_grid", "voxel_views"):
+            for pair in iterate_pairs(self._reader, name, lambda _: None):
+                _, volume, values = voxel_grid_from_msgs(pair.image, pair.info, name)
+                found[name] = volume, values
+        if "voxel_grid" in found:
+            volume, likelihood = found["voxel_grid"]
+            views = found.get("voxel_views", (volume, None))[1]
+            self.store.put_grid("main", grid_of(volume, likelihood, views, p), p.min_views_fraction)
+
+    def _composites(self) -> None:
+        for name in ("multilook", "color_by_aspect"):
+            for pair in iterate_pairs(self._reader, name, lambda _: None):
+                info, pixels = ground_picture_from_msgs(pair.image, pair.info, name)
+                shown = codes.amplitude_codes(pixels) if name == "multilook" else np.asarray(pixels)
+                self.store.put_picture(name, info, shown)
+
+
+__all__ = ["PathSource", "Reduced", "Shape", "codes_of", "grid_of", "spooled"]

@@ -1,0 +1,133 @@
+"""The store behind the page, and who is answered by its server."""
+
+from __future__ import annotations
+
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+from synthetic import entry
+
+from csas_shadow_ros.core.mesh import mesh_from_grid
+from csas_shadow_ros.viewer import codes
+from csas_shadow_ros.viewer.server import ViewerServer, is_loopback
+from csas_shadow_ros.viewer.source import PathSource
+from csas_shadow_ros.viewer.store import Spool, ViewerError, ViewStore
+
+
+def get(url: str, **headers: str) -> tuple[int, bytes]:
+    request = urllib.request.Request(url, headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=10) as answer:
+            return answer.status, answer.read()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read()
+
+
+def test_codes_are_levels_over_the_median_to_half_a_step() -> None:
+    rng = np.random.default_rng(0)
+    amplitude = rng.rayleigh(3.0, (200, 200)).astype(np.float32)
+    amplitude[0, 0] = np.nan
+    made = codes.amplitude_codes(amplitude)
+    assert made[0, 0] == 0
+    db = 20 * np.log10(amplitude / np.nanmedian(amplitude))
+    told = codes.LOW_DB + codes.STEP_DB * (made.astype(float) - 1)
+    inside = (made > 1) & (made < 255)
+    assert np.abs(told - db)[inside].max() <= codes.STEP_DB / 2 + 1e-3
+
+
+def test_a_likelihood_comes_back_of_its_codes_to_half_a_step_and_unknown_stays_unknown() -> None:
+    values = np.linspace(0, 1, 500, dtype=np.float32).reshape(20, 25)
+    values[3, 3] = np.nan
+    back = codes.likelihood_of(codes.likelihood_codes(values))
+    assert np.isnan(back[3, 3])
+    assert np.nanmax(np.abs(back - values)) <= 0.5 / 254 + 1e-6
+
+
+def test_what_the_spool_keeps_comes_back(tmp_path) -> None:
+    spool, rng = Spool(), np.random.default_rng(1)
+    arrays = [rng.integers(0, 255, (n, 7), np.uint8) for n in (3, 50, 9)]
+    loads = [spool.put(a) for a in arrays]
+    for array, load in zip(arrays, loads, strict=True):
+        np.testing.assert_array_equal(load(), array)
+
+
+def test_the_same_view_again_is_no_news_and_a_view_of_another_run_clears_the_store() -> None:
+    store, told = ViewStore(), []
+    store.listeners.append(told.append)
+    for i in range(5):
+        store.put_view("shadow", entry(i))
+        store.put_view("shadow", entry(i))
+    assert [n["type"] for n in told] == ["view"] * 5
+    other = entry(2)
+    moved = type(other.info)(**{**vars(other.info), "stamp_ns": 7})
+    store.put_view("shadow", type(other)(moved, "x", other.load))
+    assert list(store.sets["shadow"]) == [7]
+    assert [n["type"] for n in told[5:]] == ["all", "view"]
+
+
+def test_a_finished_run_shows_every_set_and_both_methods(run_store) -> None:
+    scene = run_store.scene()
+    assert {n: len(s["views"]) for n, s in scene["sets"].items() if n != "reduced"} == {
+        "sub_aperture": 72,
+        "shadow": 72,
+        "likelihood": 72,
+        "shadow_mask": 72,
+    }
+    assert {v["method"] for v in scene["volumes"].values()} == {"consensus", "soft"}
+    assert scene["dimensions"]["intervals"]["length_m"]
+    assert set(scene["pictures"]) == {"multilook", "color_by_aspect"}
+
+
+def test_a_bag_without_views_is_refused_with_what_to_do(tiny_box_bag) -> None:
+    with pytest.raises(ViewerError, match=r"holds no views.*csas-shadow run"):
+        PathSource(ViewStore(), tiny_box_bag.path)
+
+
+def test_a_bag_alone_gives_dimensions_with_intervals(results) -> None:
+    store = ViewStore()
+    source = PathSource(store, results / "result.mcap")
+    source.start()
+    assert source.done.wait(60)
+    assert store.scene()["dimensions"]["intervals"]["length_m"]
+    assert len(mesh_from_grid(store.grids["main"]).faces) > 0
+
+
+@pytest.mark.parametrize(
+    ("host", "here"),
+    [("127.0.0.1", True), ("::1", True), ("localhost", True), ("0.0.0.0", False), ("sonar", False)],
+)
+def test_loopback_is_told_from_the_network(host: str, here: bool) -> None:
+    assert is_loopback(host) is here
+    assert (ViewerServer(ViewStore(), host).token is None) is here
+
+
+def test_on_the_network_nothing_is_answered_without_the_token(serve) -> None:
+    url = serve(ViewStore(), host="0.0.0.0")
+    bare, _, token = url.replace("0.0.0.0", "127.0.0.1").partition("?token=")
+    assert len(token) >= 20
+    for path in ("", "api/scene", "static/app.js", "ws", "api/export.html"):
+        assert get(bare + path)[0] == 401
+        assert get(f"{bare}{path}?token=wrong")[0] == 401
+    assert get(f"{bare}?token={token}")[0] == 200
+    assert get(f"{bare}api/scene", Cookie=f"csas_viewer_token={token}")[0] == 200
+
+
+def test_a_page_of_somebody_else_is_not_answered(serve) -> None:
+    url = serve(ViewStore())
+    assert get(f"{url}api/scene")[0] == 200
+    assert get(f"{url}api/scene", Origin="http://elsewhere.example")[0] == 403
+    assert get(f"{url}api/scene", Host="elsewhere.example")[0] == 403
+
+
+@pytest.mark.parametrize(("path", "code", "word"), [
+    ("api/view/shadow/1/0.jpg", 404, "no view"), ("api/volume/main/0.bin", 404, "no volume"),
+    ("api/surface/main.json?threshold=x", 404, "no volume"), ("api/export.html?step=0", 400, "step is '0'"),
+    ("static/../server.py", 404, ""),
+])  # fmt: skip
+def test_what_is_not_there_is_named(serve, path: str, code: int, word: str) -> None:
+    status, body = get(serve(ViewStore()) + path)
+    assert status == code
+    assert word in body.decode()

@@ -1,0 +1,121 @@
+// Compressed views in memory, few of them decoded: those round the cursor and where it is heading.
+const DECODED = 24, DECODES = 2, FETCHES = 4;
+
+export class Loader {
+  constructor(files, changed) {
+    this.files = files; // of a page that was saved: address → data URL
+    this.changed = changed;
+    this.blobs = new Map(); // address → Blob
+    this.bitmaps = new Map(); // address → ImageBitmap, least recently used first
+    this.busy = new Map(); // address → "fetch" | "decode"
+    this.failed = new Map(); // address → when
+    this.wanted = []; // addresses to decode, the most wanted first
+    this.all = []; // addresses to fetch sometime, coarse to fine
+    this.json = new Map();
+  }
+
+  async get(address) {
+    if (this.files) {
+      const found = this.files[address];
+      if (!found) throw new Error(`${address} is not in this file`);
+      const [head, data] = found.split(",");
+      const raw = atob(data), bytes = new Uint8Array(raw.length);
+      for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
+      return new Blob([bytes], { type: head.slice(5, head.indexOf(";")) });
+    }
+    const answer = await fetch(address);
+    if (!answer.ok) throw new Error(`${address}: ${answer.status} ${await answer.text()}`);
+    return answer.blob();
+  }
+
+  has(address) { return this.bitmaps.has(address); }
+
+  bitmap(address) {
+    const found = this.bitmaps.get(address);
+    if (found) {
+      this.bitmaps.delete(address);
+      this.bitmaps.set(address, found);
+    }
+    return found;
+  }
+
+  want(addresses) {
+    this.wanted = addresses;
+    this.pump();
+  }
+
+  fetchAll(addresses) {
+    this.all = addresses;
+    const kept = new Set(addresses);
+    for (const a of this.blobs.keys()) if (!kept.has(a) && !a.endsWith(".png")) this.blobs.delete(a);
+    this.pump();
+  }
+
+  running(kind) { return [...this.busy.values()].filter((k) => k === kind).length; }
+
+  pump() {
+    for (const a of this.wanted) {
+      if (this.bitmaps.has(a) || this.busy.has(a)) continue;
+      if (this.blobs.has(a)) {
+        if (this.running("decode") < DECODES) this.decode(a);
+      } else if (!this.paused && this.running("fetch") < FETCHES) this.fetch(a);
+    }
+    while (!this.paused && this.all.length && this.running("fetch") < FETCHES - 1) {
+      const a = this.all.shift();
+      if (!this.blobs.has(a) && !this.busy.has(a)) this.fetch(a);
+    }
+  }
+
+  async fetch(a) {
+    if (performance.now() - (this.failed.get(a) ?? -1e9) < 2000) return;
+    this.busy.set(a, "fetch");
+    try {
+      const blob = await this.get(a);
+      this.blobs.set(a, blob);
+      if (a.endsWith(".png")) {
+        // Exact pictures are large: a few are kept.
+        const exact = [...this.blobs.keys()].filter((k) => k.endsWith(".png"));
+        for (const old of exact.slice(0, -8)) this.blobs.delete(old);
+      }
+    } catch {
+      this.failed.set(a, performance.now()); // the server is away: it is asked again
+      setTimeout(() => this.pump(), 2100);
+    }
+    this.busy.delete(a);
+    this.pump();
+  }
+
+  async decode(a) {
+    this.busy.set(a, "decode");
+    try {
+      this.bitmaps.set(a, await createImageBitmap(this.blobs.get(a)));
+      while (this.bitmaps.size > 2 * DECODED) {
+        const [old, bitmap] = this.bitmaps.entries().next().value;
+        this.bitmaps.delete(old);
+        bitmap.close();
+      }
+      this.changed();
+    } catch {
+      this.blobs.delete(a);
+    }
+    this.busy.delete(a);
+    this.pump();
+  }
+
+  lines(address) {
+    if (!this.json.has(address)) {
+      this.json.set(address, null);
+      this.get(address)
+        .then(async (blob) => { this.json.set(address, JSON.parse(await blob.text())); this.changed(); })
+        .catch(() => setTimeout(() => this.json.delete(address), 2000));
+    }
+    return this.json.get(address);
+  }
+}
+
+export function coarseToFine(list) {
+  const order = [], seen = new Set();
+  for (let stride = 64; stride >= 1; stride >>= 1)
+    for (let i = 0; i < list.length; i += stride) if (!seen.has(i)) { seen.add(i); order.push(list[i]); }
+  return order;
+}
