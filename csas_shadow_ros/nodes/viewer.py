@@ -252,7 +252,7 @@ class ViewerNode(CsasNode):
         # A stream that nobody publishes cannot be caught up with.
         fed = [s for s in fed if self.count_publishers(stream_of(s).image_topic)]
         lacking = any(len(self.store.sets[s]) < total for s in fed)
-        # Not before everybody has been heard of, nor for ever: a view that a stage refuses is never to be had.
+        # Not before everybody has been heard of, nor for ever: a view that a stage refuses never comes.
         settled = time.monotonic() - self._since_s > _SETTLE_S and self._queue.empty()
         tries = self._tries.get((beat.instance, total), 0)
         if finished and lacking and settled and tries < _TRIES:
