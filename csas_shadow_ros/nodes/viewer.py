@@ -252,7 +252,7 @@ class ViewerNode(CsasNode):
         # A stream that nobody publishes cannot be caught up with.
         fed = [s for s in fed if self.count_publishers(stream_of(s).image_topic)]
         lacking = any(len(self.store.sets[s]) < total for s in fed)
-        # Not before everybody has been heard of, nor for ever: a view that a stage refuses never comes.
+        # Not before everybody is heard of, nor for ever: a view that a stage refuses is never to be had.
         settled = time.monotonic() - self._since_s > _SETTLE_S and self._queue.empty()
         tries = self._tries.get((beat.instance, total), 0)
         if finished and lacking and settled and tries < _TRIES:
@@ -269,7 +269,7 @@ class ViewerNode(CsasNode):
         self.get_logger().info("the run is finished: asking for the views that were missed")
 
     def _leave(self) -> None:
-        """Say goodbye, and take the kept reports back: a later source would wait for who sent them."""
+        """Say goodbye and take the kept reports back: a later source would wait for their sender."""
         with self._beat_lock:
             for inlet in self.inlets:
                 self._heartbeats.publish(progress_to_msg(self.messages, inlet.beat(leaving=True)))

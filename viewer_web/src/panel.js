@@ -125,7 +125,7 @@ export class Panel {
   }
 
   draw() {
-    const { app, slider } = this, canvas = slider.picture, g = canvas.getContext("2d", { alpha: false });
+    const { app, slider } = this, canvas = slider.picture, g = canvas.getContext("2d", { alpha: false, willReadFrequently: true });
     if (!slider.side) return;
     const found = this.find(), { about, bitmap, view } = found, k = canvas.width / slider.side, half = canvas.width / 2;
     this.found = found;

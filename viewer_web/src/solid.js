@@ -129,9 +129,13 @@ export class Solid {
   dirty() {
     if (!this.renderer || this.waiting) return;
     this.waiting = true;
-    // Scrubbing goes first: the object follows at a few pictures a second.
-    const pause = this.app.scrubbing() ? 150 : 0;
-    setTimeout(() => requestAnimationFrame(() => { this.waiting = false; this.render(); }), pause);
+    // Scrubbing goes first: the object follows once the cursor rests, or twice a second while it plays.
+    const draw = () => requestAnimationFrame(() => {
+      if (this.app.scrubbing() && !this.app.playing) return void setTimeout(draw, 120);
+      this.waiting = false;
+      this.render();
+    });
+    setTimeout(draw, this.app.scrubbing() ? 500 : 0);
   }
 
   render() {
