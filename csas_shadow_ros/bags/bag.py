@@ -134,6 +134,13 @@ class BagReader:
         """Whether changed bits would have been noticed in what was read so far."""
         return self._foreign is None and all(f.has_checksums for f in self._files)
 
+    @property
+    def indexed_files(self) -> list[McapFile] | None:
+        """The bag's MCAP files if all of them have an index; else None."""
+        if self._foreign is not None or not all(f.indexed for f in self._files):
+            return None
+        return list(self._files)
+
     def _complain(self, problem: str) -> None:
         if problem not in self.problems:
             self.problems.append(problem)

@@ -93,8 +93,10 @@ class McapFile:
         #: False if some of the messages read so far are not covered by a checksum.
         self.has_checksums = True
         self._schemas: dict[int, Schema] = {}
-        self._chunks: list[ChunkIndex] = []
-        self._indexed = False
+        #: Where the chunks lie; empty without an index.
+        self.chunks: list[ChunkIndex] = []
+        #: Whether every message can be found without reading the others.
+        self.indexed = False
         try:
             with path.open("rb") as file:
                 magic = file.read(len(MAGIC))
@@ -104,7 +106,7 @@ class McapFile:
                     raise BagError(f"{path} is no MCAP file (starts with {magic!r}); expected {MAGIC!r}")
                 self.size = file.seek(0, io.SEEK_END)
                 self._read_summary(file)
-                if not self._indexed:
+                if not self.indexed:
                     self._scan(file)
         except OSError as error:
             raise BagError(f"cannot read {path}: {error.strerror}") from error
@@ -136,19 +138,19 @@ class McapFile:
                 if op == _STATISTICS:
                     statistics = Statistics.read(_stream(body))
                 elif op == _CHUNK_INDEX:
-                    self._chunks.append(ChunkIndex.read(_stream(body)))
+                    self.chunks.append(ChunkIndex.read(_stream(body)))
                 else:
                     self._definition(op, body)
         except (McapError, struct.error, ValueError, _ShortError) as error:
             self._cut_short(f"its summary cannot be parsed ({error})")
-            self._chunks.clear()
+            self.chunks.clear()
             return
         if statistics is not None:
             self.counts = {c: n for c, n in statistics.channel_message_counts.items() if n}
             named = set(self.counts) <= set(self.channels)
             # Messages outside chunks are not in the index: then only walking finds them all.
-            self._indexed = named and (bool(self._chunks) or statistics.message_count == 0)
-            self.compressions = {c.compression for c in self._chunks}
+            self.indexed = named and (bool(self.chunks) or statistics.message_count == 0)
+            self.compressions = {c.compression for c in self.chunks}
 
     def _cut_short(self, why: str) -> None:
         self.complete = False
@@ -185,7 +187,7 @@ class McapFile:
         Data are views of the chunk that holds them; nothing else of the file is kept.
         """
         with self.path.open("rb") as file:
-            if self._indexed:
+            if self.indexed:
                 yield from self._through_index(file, {i for i, c in self.channels.items() if wanted(c)})
             else:
                 # Damage was reported by the scan that went before.
@@ -194,7 +196,7 @@ class McapFile:
     def _through_index(self, file: BinaryIO, channels: set[int]) -> Iterator[RawMessage]:
         chunks = [
             c
-            for c in self._chunks
+            for c in self.chunks
             # Without message indexes nobody knows what is in the chunk.
             if not c.message_index_offsets or channels & set(c.message_index_offsets)
         ]
@@ -204,23 +206,34 @@ class McapFile:
         for chunk in chunks:
             while pending and pending[0][0] < chunk.message_start_time:
                 yield heapq.heappop(pending)[2]
-            file.seek(chunk.chunk_start_offset)
-            try:
-                op, body = self._read_record(file)
-                if op != _CHUNK:
-                    raise _ShortError(f"no chunk where the index says (record type {op})")
-                records = list(self._unpack(body))
-            except (_ShortError, struct.error, ValueError) as error:
-                self._damaged(chunk.chunk_start_offset, error, self._complain)
-                continue
-            for op, body in records:
-                if op == _MESSAGE:
-                    message = _message(body)
-                    if message.channel_id in channels:
-                        heapq.heappush(pending, (message.log_time_ns, serial, message))
-                        serial += 1
+            for message in self._messages_of(file, chunk, channels):
+                heapq.heappush(pending, (message.log_time_ns, serial, message))
+                serial += 1
         while pending:
             yield heapq.heappop(pending)[2]
+
+    def messages_of(self, chunk: ChunkIndex, channels: set[int]) -> list[RawMessage]:
+        """Read one chunk of the index, and none of the others.
+
+        Returns
+        -------
+        list of RawMessage
+            Its messages of these channels; none if the chunk is damaged, which is complained of.
+        """
+        with self.path.open("rb") as file:
+            return self._messages_of(file, chunk, channels)
+
+    def _messages_of(self, file: BinaryIO, chunk: ChunkIndex, channels: set[int]) -> list[RawMessage]:
+        file.seek(chunk.chunk_start_offset)
+        try:
+            op, body = self._read_record(file)
+            if op != _CHUNK:
+                raise _ShortError(f"no chunk where the index says (record type {op})")
+            messages = [_message(record) for op, record in self._unpack(body) if op == _MESSAGE]
+        except (_ShortError, struct.error, ValueError) as error:
+            self._damaged(chunk.chunk_start_offset, error, self._complain)
+            return []
+        return [m for m in messages if m.channel_id in channels]
 
     def _walk(
         self,

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from mcap.records import ChunkIndex
@@ -16,9 +14,6 @@ from ..bags import BagReader
 from ..bags.bag import BagMessage
 from ..bags.mcap_file import McapFile
 from ..core.errors import BagError
-
-_MESSAGE = 0x05
-_HEAD = struct.Struct("<HIQQ")
 
 
 class BagIndex:
@@ -37,8 +32,10 @@ class BagIndex:
 
     def __init__(self, reader: BagReader) -> None:
         self.reader = reader
-        if reader._foreign is not None or not all(f._indexed for f in reader._files):
+        files = reader.indexed_files
+        if files is None:
             raise BagError(f"{reader.path} has no index; expected a complete MCAP bag")
+        self.files = files
 
     def places(self, stream_name: str, stamps: set[int]) -> dict[int, Callable[[], Any]]:
         """Return a function for each stamp that reads its image message.
@@ -48,9 +45,9 @@ class BagIndex:
         """
         topic = absolute_name(stream(stream_name).image_topic, self.reader.namespace)
         found: dict[int, Callable[[], Any]] = {}
-        for file in self.reader._files:
+        for file in self.files:
             channels = {i for i, c in file.channels.items() if c.topic == topic}
-            for chunk in file._chunks:
+            for chunk in file.chunks:
                 if not channels & set(chunk.message_index_offsets):
                     continue
                 alone = chunk.message_start_time == chunk.message_end_time
@@ -76,18 +73,9 @@ class BagIndex:
 
     @staticmethod
     def _in_chunk(file: McapFile, chunk: ChunkIndex, channels: set[int], topic: str) -> list[tuple[int, Any]]:
-        path: Path = file.path
-        with path.open("rb") as opened:
-            opened.seek(chunk.chunk_start_offset)
-            _, body = file._read_record(opened)
+        kinds = {i: file.channels[i].type_name for i in channels}
         found = []
-        try:
-            for op, record in file._unpack(body):
-                if op == _MESSAGE and _HEAD.unpack_from(record)[0] in channels:
-                    channel, _, when, _ = _HEAD.unpack_from(record)
-                    kind = file.channels[channel].type_name
-                    message = BagMessage(topic, kind, when, 0, record[_HEAD.size :]).decode()
-                    found.append((stamp_to_ns(message.header.stamp), message))
-        except (ValueError, struct.error) as error:
-            raise BagError(f"{path.name}: the chunk at byte {chunk.chunk_start_offset}: {error}") from error
+        for raw in file.messages_of(chunk, channels):
+            message = BagMessage(topic, kinds[raw.channel_id], raw.log_time_ns, 0, raw.data).decode()
+            found.append((stamp_to_ns(message.header.stamp), message))
         return found

@@ -72,7 +72,7 @@ class ViewerServer:
         self._queues: set[asyncio.Queue[str | None]] = set()
         self._pool = ThreadPoolExecutor(2, thread_name_prefix="viewer")
         self._reduced = threading.Lock()
-        self._loop = asyncio.new_event_loop()
+        self._loop: asyncio.AbstractEventLoop | None = None  # once it listens
         self._ready = threading.Event()
         self._failed: BaseException | None = None
         self._stop: asyncio.Event | None = None
@@ -102,30 +102,26 @@ class ViewerServer:
         """End, and cut the pages off; they come back when there is a server again."""
         if self._notice in self.store.listeners:
             self.store.listeners.remove(self._notice)
-        if self._stop is not None and self._thread.is_alive():
+        if self._loop is not None and self._stop is not None and self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._stop.set)
             self._thread.join(10.0)
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
         try:
-            self._loop.run_until_complete(self._serve())
+            asyncio.run(self._serve())
         except BaseException as error:
             self._failed = error
         finally:
             self._ready.set()
-            self._loop.close()
 
     async def _serve(self) -> None:
-        self._stop = asyncio.Event()
+        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         runner = web.AppRunner(self._app(), access_log=None, shutdown_timeout=0.5)
         await runner.setup()
         try:
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
-            listening = socket.socket(family)
-            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listening.bind((self.host, self.port))
+            listening = socket.create_server((self.host, self.port), family=family)
             await web.SockSite(runner, listening).start()
             self.port = listening.getsockname()[1]
             self._ready.set()
@@ -291,6 +287,8 @@ class ViewerServer:
 
     def _notice(self, notice: dict[str, Any]) -> None:
         text = json.dumps(notice)
+        if self._loop is None:
+            return
         with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
             self._loop.call_soon_threadsafe(self._spread, text)
 
