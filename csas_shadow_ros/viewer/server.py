@@ -122,13 +122,23 @@ class ViewerServer:
         try:
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
             listening = socket.create_server((self.host, self.port), family=family)
-            await web.SockSite(runner, listening).start()
+            site = web.SockSite(runner, listening)
+            await site.start()
             self.port = listening.getsockname()[1]
             self._ready.set()
             await self._stop.wait()
             for queue in self._queues:
                 with contextlib.suppress(asyncio.QueueFull):
                     queue.put_nowait(None)
+            await site.stop()
+            served = runner.server
+            assert served is not None  # set up above
+            open_yet = [c.transport for c in served.connections if c.transport is not None]
+            await runner.cleanup()
+            # A page that has stopped reading would keep what it was sent, and the socket, for ever.
+            for transport in open_yet:
+                transport.abort()
+            await asyncio.sleep(0)
         finally:
             await runner.cleanup()
 

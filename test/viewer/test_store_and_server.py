@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import json
+import socket
 import urllib.error
 import urllib.request
 
@@ -10,6 +13,7 @@ import pytest
 from synthetic import entry
 
 from csas_shadow_ros.core.mesh import mesh_from_grid
+from csas_shadow_ros.core.volume import Volume, VoxelGrid
 from csas_shadow_ros.viewer import codes
 from csas_shadow_ros.viewer.server import ViewerServer, is_loopback
 from csas_shadow_ros.viewer.source import PathSource
@@ -131,3 +135,20 @@ def test_what_is_not_there_is_named(serve, path: str, code: int, word: str) -> N
     status, body = get(serve(ViewStore()) + path)
     assert status == code
     assert word in body.decode()
+
+
+def test_a_page_that_has_stopped_reading_keeps_no_socket_open() -> None:
+    store = ViewStore()
+    volume = Volume.around((0.0, 0.0), (4.0, 4.0, 4.0), 0.02)  # 8 MB: more than the system's buffers hold
+    likelihood = np.random.default_rng(1).random(volume.shape, np.float32)
+    views = np.full(volume.shape, 9, np.uint16)
+    store.put_grid("main", VoxelGrid(volume, likelihood, views, 0.5, likelihood < 0.5, "soft"))
+    server = ViewerServer(store)
+    server.start()
+    revision = json.loads(get(f"{server.url}api/scene")[1])["volumes"]["main"]["rev"]
+    with socket.create_connection(("127.0.0.1", server.port)) as stuck:
+        asked = f"GET /api/volume/main/{revision}.bin HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n\r\n"
+        stuck.sendall(asked.encode())
+        assert stuck.recv(1) == b"H"
+        server.stop()
+        gc.collect()  # what is left open warns when it is collected, and a warning fails a test
