@@ -60,6 +60,11 @@ class Watched:
             "!csas.scrubbing() && !csas.frame && csas.panels.every(p => p.found?.bitmap && p.found.exact)"
         )
 
+    def drawn(self) -> None:
+        """Wait until what is pending has been drawn, however slow the machine is."""
+        self.js("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))")
+        self.until("!csas.frame")
+
     def strangers(self) -> list[str]:
         """Return the addresses asked for that are not of this machine."""
         local = ("localhost", "127.0.0.1", "")

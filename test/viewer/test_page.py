@@ -114,6 +114,8 @@ def test_play_goes_on_by_itself_and_stops(watched, serve):
     watched.page.keyboard.press("Space")
     watched.until("csas.state.aspect > 20")
     watched.page.keyboard.press("Space")
+    watched.until("!csas.playing")
+    watched.drawn()
     stopped = watched.js("csas.state.aspect")
     watched.page.wait_for_timeout(400)
     assert watched.js("csas.state.aspect") == stopped
@@ -135,7 +137,7 @@ def test_views_that_have_not_arrived_are_a_gap_that_a_live_run_fills(watched, se
         store.put_view("shadow", entry(i))
         store.put_view("sub_aperture", entry(i))
     watched.until(f"csas.views('shadow').length === {COUNT}")
-    watched.page.wait_for_timeout(200)
+    watched.drawn()
     assert bright(222)
     store.put_view("shadow", entry(0, code=200))  # a new revision of the view that is shown
     watched.until("csas.panels[1].found.about.rev === csas.sameStamp('shadow', csas.current).rev && csas.panels[1].found.exact")
@@ -179,7 +181,7 @@ def test_every_layer_shows_a_picture_and_the_range_changes_it(watched, serve, ru
     for key in "123456":
         page.keyboard.press(key)
         watched.until("csas.panels[1].found?.bitmap && csas.panels[1].found.exact && !csas.panels[1].found.late", 30)
-        watched.page.wait_for_timeout(100)
+        watched.drawn()
         data = watched.js("csas.panels[1].slider.picture.toDataURL()")
         assert data not in seen
         seen.add(data)
@@ -191,18 +193,17 @@ def test_every_layer_shows_a_picture_and_the_range_changes_it(watched, serve, ru
     page.keyboard.press("2")
     watched.settle()
 
-    def level() -> float:
-        watched.page.wait_for_timeout(60)
-        return watched.js(
-            "(() => { const c = csas.panels[1].slider.picture, d = c.getContext('2d').getImageData(c.width * .4, c.height * .7, 60, 60).data;"
-            " let s = 0; for (let i = 0; i < d.length; i += 4) s += d[i]; return s * 4 / d.length; })()"
-        )
-
+    level = (
+        "(() => { const c = csas.panels[1].slider.picture, d = c.getContext('2d').getImageData(c.width * .4, c.height * .7, 60, 60).data;"
+        " let s = 0; for (let i = 0; i < d.length; i += 4) s += d[i]; return s * 4 / d.length; })()"
+    )
     page.keyboard.press("c")
-    first = level()
+    watched.until("!csas.state.contour")
+    watched.drawn()
+    first = watched.js(level)
     for _ in range(6):
         page.keyboard.press("Shift+BracketLeft")
-    assert level() > first + 5, "a lower brightest level shows brighter"
+    watched.until(f"{level} > {first + 5}")  # a lower brightest level shows brighter
 
 
 def test_the_ruler_reads_a_shadow_and_the_height_that_it_implies(watched, serve, run_store):
@@ -215,7 +216,7 @@ def test_the_ruler_reads_a_shadow_and_the_height_that_it_implies(watched, serve,
     watched.page.mouse.down()
     watched.page.mouse.move(x, y + 85)
     watched.page.mouse.up()
-    watched.page.wait_for_timeout(100)
+    watched.drawn()
     a, b = watched.js("csas.state.ruler")
     sonar = np.array(watched.js("csas.current.sonar"))
     # Independently: the ray from the sonar to the tip passes over the start at this height.
@@ -311,7 +312,7 @@ def test_picture_mesh_link_and_file_can_be_taken_away(watched, serve, run_store,
     expected = mesh_from_grid(run_store.grids["main"])
     assert trimesh.load_mesh(tmp_path / "m.stl").volume == pytest.approx(expected.volume, rel=1e-4)
     page.keyboard.press("l")
-    page.wait_for_timeout(100)
+    watched.until("decodeURIComponent(location.hash) === decodeURIComponent(csas.link())")
     link = page.url
     watched.js("csas.setAspect(200), csas.fit()")
     page.wait_for_timeout(400)
