@@ -101,6 +101,7 @@ def live_graph():
     return [
         *(node(name) for name in STAGES),
         node("composites", condition=IfCondition(LaunchConfiguration("composites"))),
+        node("viewer", condition=IfCondition(LaunchConfiguration("viewer"))),
         node("bag_recorder", recording, IfCondition(NotEqualsSubstitution(out, ""))),
         node("bag_player", playing, IfCondition(NotEqualsSubstitution(bag, ""))),
     ]
@@ -130,6 +131,9 @@ def generate_launch_description():
             ),
             DeclareLaunchArgument("out", default_value="", description="bag to record while running live"),
             DeclareLaunchArgument("composites", default_value="true", description="make the composites"),
+            DeclareLaunchArgument(
+                "viewer", default_value="false", description="the operator's view, in a browser"
+            ),
             DeclareLaunchArgument("namespace", default_value="csas", description="namespace of all topics"),
             DeclareLaunchArgument("respawn", default_value="true", description="restart a node that dies"),
             DeclareLaunchArgument(
