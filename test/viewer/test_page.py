@@ -125,20 +125,19 @@ def test_views_that_have_not_arrived_are_a_gap_that_a_live_run_fills(watched, se
     store = store_of(range(30))  # 0 to 116 degrees
     watched.open(serve(store))
 
-    def bright(aspect: float) -> bool:
+    def bright(aspect: float) -> str:
         k = f"csas.panels[1].slider, a = {math.radians(aspect)}, c = s.ring, f = c.width / s.side"
         pixel = "c.width / 2 + f * s.radius * Math.cos(a), c.width / 2 - f * s.radius * Math.sin(a), 1, 1"
-        return watched.js(f"(() => {{ const s = {k}; return c.getContext('2d').getImageData({pixel}).data[0]; }})()") > 100
+        return f"(() => {{ const s = {k}; return c.getContext('2d').getImageData({pixel}).data[0]; }})() > 100"
 
     watched.settle()
-    assert bright(62)
-    assert not bright(222)
+    assert watched.js(bright(62))
+    assert not watched.js(bright(222))
     for i in range(30, COUNT):
         store.put_view("shadow", entry(i))
         store.put_view("sub_aperture", entry(i))
     watched.until(f"csas.views('shadow').length === {COUNT}")
-    watched.drawn()
-    assert bright(222)
+    watched.until(bright(222))
     store.put_view("shadow", entry(0, code=200))  # a new revision of the view that is shown
     watched.until("csas.panels[1].found.about.rev === csas.sameStamp('shadow', csas.current).rev && csas.panels[1].found.exact")
 
