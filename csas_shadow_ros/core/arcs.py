@@ -30,6 +30,12 @@ class Arc:
         ahead = (other.start_rad - self.start_rad) % TWO_PI
         return ahead <= self.width_rad or TWO_PI - ahead <= other.width_rad
 
+    def pieces(self) -> list[tuple[float, float]]:
+        """Return (start, end) within [0, 2π]: two where an arc of less than the circle passes 0."""
+        start = self.start_rad % TWO_PI
+        end = start + self.width_rad
+        return [(start, min(end, TWO_PI)), (0.0, end - TWO_PI)] if end > TWO_PI else [(start, end)]
+
     def __str__(self) -> str:
         start = math.degrees(self.start_rad) % 360.0
         return f"{start:.1f}° to {start + math.degrees(self.width_rad):.1f}°"
@@ -47,11 +53,8 @@ class Arcs:
         if arc.width_rad >= TWO_PI - TOLERANCE_RAD:
             self._pieces = [(0.0, TWO_PI)]
             return
-        start = arc.start_rad % TWO_PI
-        end = start + arc.width_rad
-        new = [(start, min(end, TWO_PI)), (0.0, end - TWO_PI)] if end > TWO_PI else [(start, end)]
         merged: list[tuple[float, float]] = []
-        for low, high in sorted([*self._pieces, *new]):
+        for low, high in sorted([*self._pieces, *arc.pieces()]):
             if merged and low <= merged[-1][1] + TOLERANCE_RAD:
                 merged[-1] = (merged[-1][0], max(high, merged[-1][1]))
             else:
@@ -74,12 +77,9 @@ class Arcs:
             return True
         if arc.width_rad >= TWO_PI:
             return False
-        start = arc.start_rad % TWO_PI
-        end = start + arc.width_rad
-        parts = [(start, min(end, TWO_PI))] + ([(0.0, end - TWO_PI)] if end > TWO_PI else [])
         return all(
             any(low <= a + TOLERANCE_RAD and b <= high + TOLERANCE_RAD for low, high in self._pieces)
-            for a, b in parts
+            for a, b in arc.pieces()
         )
 
     def contains(self, aspects_rad: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -53,6 +53,18 @@ class ProcessedView:
     sides: SilhouetteSides | None
     look: EchoLook
 
+    def carves(self, parameters: CarvingParameters) -> View:
+        """Return what a method carves with.
+
+        Raises
+        ------
+        ViewError
+            If the method takes silhouettes, and the view has none.
+        """
+        if parameters.takes_masks:
+            return require_silhouette(self.mask)  # 4.1 space carving
+        return self.likelihood  # 4.2 soft carving
+
 
 @dataclass(eq=False)
 class Result:
@@ -281,10 +293,7 @@ def _integrate(result: Result, carvers: list[Carver], view: ProcessedView) -> No
     used = False
     for carver in carvers:
         try:
-            if carver.parameters.takes_masks:
-                integrated = carver.integrate(require_silhouette(view.mask))  # 4.1 space carving
-            else:
-                integrated = carver.integrate(view.likelihood)  # 4.2 soft carving
+            integrated = carver.integrate(view.carves(carver.parameters))
         except ViewError as error:
             if carver is carvers[0]:
                 result.rejected[round(math.degrees(view.shadow.info.aspect_rad), 6)] = str(error)

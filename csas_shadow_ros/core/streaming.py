@@ -25,7 +25,6 @@ from .geometry import TWO_PI, CoherentImage, Track
 from .parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from .pipeline import ProcessedView, process_view
 from .sector import Sector, same_grid
-from .segmentation import require_silhouette
 from .subaperture import Spectrum, SubApertures
 from .target import Target, choose_target, find_target, spectrum_sign_evidence
 from .threads import in_order
@@ -522,8 +521,7 @@ class StreamedRun:
             try:
                 if isinstance(view, ViewError):
                     raise view
-                masks = p.carving.takes_masks
-                self.carver.integrate(require_silhouette(view.mask) if masks else view.likelihood)
+                self.carver.integrate(view.carves(p.carving))
             except ViewError as error:
                 self.rejected[stamp] = str(error)
                 continue

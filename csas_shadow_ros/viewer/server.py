@@ -122,15 +122,16 @@ class ViewerServer:
         try:
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
             listening = socket.create_server((self.host, self.port), family=family)
-            site = web.SockSite(runner, listening)
-            await site.start()
+            await web.SockSite(runner, listening).start()
             self.port = listening.getsockname()[1]
             self._ready.set()
             await self._stop.wait()
             for queue in self._queues:
                 with contextlib.suppress(asyncio.QueueFull):
                     queue.put_nowait(None)
-            await site.stop()
+        finally:
+            for each in list(runner.sites):
+                await each.stop()
             served = runner.server
             assert served is not None  # set up above
             open_yet = [c.transport for c in served.connections if c.transport is not None]
@@ -139,8 +140,6 @@ class ViewerServer:
             for transport in open_yet:
                 transport.abort()
             await asyncio.sleep(0)
-        finally:
-            await runner.cleanup()
 
     def _app(self) -> web.Application:
         app = web.Application(middlewares=[self._guard])
