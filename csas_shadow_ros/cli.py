@@ -44,6 +44,22 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         super().__init__(prog, max_help_position=34, width=100)
 
 
+class _Command(argparse.ArgumentParser):
+    """A command whose options are made when it is the one that is asked for.
+
+    What the options of some need (profiles, stages) takes a second to import, which the others need not pay.
+    """
+
+    options: Callable[[argparse.ArgumentParser], None] | None = None
+
+    def parse_known_args(self, *args: Any, **kwargs: Any) -> Any:
+        """Make the options, once, and parse."""
+        options, self.options = self.options, None
+        if options is not None:
+            options(self)
+        return super().parse_known_args(*args, **kwargs)
+
+
 class Console:
     """Where things are said: results on stdout, all else on stderr."""
 
@@ -178,9 +194,15 @@ def build_parser() -> argparse.ArgumentParser:
         PROGRAM, description=_DESCRIPTION, epilog=_EXAMPLES, formatter_class=_Help, allow_abbrev=False
     )
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Command)
 
-    def add(name: str, summary: str, examples: str, function: Callable[..., int]) -> argparse.ArgumentParser:
+    def add(
+        name: str,
+        summary: str,
+        examples: str,
+        function: Callable[..., int],
+        options: Callable[[argparse.ArgumentParser], None] | None = None,
+    ) -> argparse.ArgumentParser:
         sub = commands.add_parser(
             name,
             help=summary,
@@ -190,6 +212,7 @@ def build_parser() -> argparse.ArgumentParser:
             allow_abbrev=False,
         )
         sub.set_defaults(function=function)
+        sub.options = options
         return sub
 
     _add_simulate(add)
@@ -219,9 +242,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _add_simulate(add: Callable[..., argparse.ArgumentParser]) -> None:
-    from .simulation import PROFILES, TARGETS
-
-    p = add(
+    add(
         "simulate",
         "make a bag of a simulated run, with its truth beside it",
         "  csas-shadow simulate box_run --profile tiny\n"
@@ -230,7 +251,13 @@ def _add_simulate(add: Callable[..., argparse.ArgumentParser]) -> None:
         "  csas-shadow simulate mine_run --target mine.stl --position 0.5 -0.3\n\n"
         "writes OUT_BAG, OUT_BAG.truth.stl and OUT_BAG.truth.json. Profile samdis takes minutes and 2 GB.",
         _simulate,
+        _simulate_options,
     )
+
+
+def _simulate_options(p: argparse.ArgumentParser) -> None:
+    from .simulation import PROFILES, TARGETS
+
     p.add_argument("out_bag", metavar="OUT_BAG", help="bag to make (a rosbag2 directory)")
     p.add_argument("--overwrite", action="store_true", help="replace a bag that is there")
     p.add_argument(
@@ -359,10 +386,7 @@ def _add_simulate(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
-    from .core.objects import MAX_OBJECTS, MOST_OBJECTS
-    from .process import START_FROM
-
-    p = add(
+    add(
         "run",
         "reconstruct the target of a bag, in this process, and write a results folder",
         "  csas-shadow run box_run --out box_results\n"
@@ -374,7 +398,14 @@ def _add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
         "and object_2.npz, object_2.stl and so on of what else stands on the seabed.\n"
         "A seabed without an object is a result like any other: it is said so, and the exit code is 0.",
         _run,
+        _run_options,
     )
+
+
+def _run_options(p: argparse.ArgumentParser) -> None:
+    from .core.objects import MAX_OBJECTS, MOST_OBJECTS
+    from .process import START_FROM
+
     p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
     p.add_argument("--namespace", help="namespace of its topics (found by itself)")
     p.add_argument(
@@ -405,15 +436,19 @@ def _add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _add_replay(add: Callable[..., argparse.ArgumentParser]) -> None:
-    from .process import START_FROM
-
-    p = add(
+    add(
         "replay",
         "reconstruct the target of a bag through the ROS 2 nodes, and write the same results folder",
         "  csas-shadow replay box_run --out box_results\n\n"
         "starts every node as a process of its own, as `ros2 launch` does, and needs ROS 2 (rclpy).",
         _replay,
+        _replay_options,
     )
+
+
+def _replay_options(p: argparse.ArgumentParser) -> None:
+    from .process import START_FROM
+
     p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
     p.add_argument(
         "--start-from",

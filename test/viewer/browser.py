@@ -72,13 +72,13 @@ class Watched:
 
 
 @contextlib.contextmanager
-def launched() -> Iterator[Any]:
-    """Start Debian's chromium; skip, and say why, where there is none."""
+def launched(*more: str) -> Iterator[Any]:
+    """Start Debian's chromium, with more arguments; skip, and say why, where there is none."""
     if not CHROMIUM:
         pytest.skip("no chromium: apt-get install chromium (or name one in CSAS_CHROMIUM)")
     sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
     with sync_api.sync_playwright() as playwright:
-        made = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        made = playwright.chromium.launch(executable_path=CHROMIUM, args=[*ARGUMENTS, *more])
         try:
             yield made
         finally:

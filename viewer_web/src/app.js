@@ -16,9 +16,10 @@ class App {
     this.volumes = {};
     this.casts = new Map();
     this.stats = { drawn: 0, events: [], latency: [], surfaces: [], first: 0 };
-    this.loader = new Loader(content?.files, () => this.dirty());
+    const startWorker = () => new Worker(this.workerAddress(content?.files));
+    this.loader = new Loader(content?.files, startWorker, () => this.dirty());
     this.panels = [new Panel($("panel-a"), this, this.state.layers[0], "Left"), new Panel($("panel-b"), this, this.state.layers[1], "Right")];
-    this.startWorker(content?.files);
+    this.startSurfaces(startWorker());
     // The first picture goes before the first object.
     setTimeout(() => this.startSolid(), 1500);
     this.controls();
@@ -261,10 +262,14 @@ class App {
 
   // The object
 
-  startWorker(files) {
-    let address = "static/worker.js";
-    if (files) address = URL.createObjectURL(new Blob([atob(files[address].split(",")[1])], { type: "text/javascript" }));
-    this.worker = new Worker(address);
+  workerAddress(files) {
+    const address = "static/worker.js";
+    if (!files) return address;
+    return (this.madeWorker ??= URL.createObjectURL(new Blob([atob(files[address].split(",")[1])], { type: "text/javascript" })));
+  }
+
+  startSurfaces(worker) {
+    this.worker = worker;
     this.worker.onmessage = ({ data }) => {
       if (data.did === "surface") {
         this.stats.surfaces.push(performance.now() - data.asked);

@@ -1,12 +1,17 @@
 // Compressed views in memory, few of them decoded: those round the cursor and where it is heading.
 const DECODED = 24, DECODES = 2, FETCHES = 4;
 
+const COLOURS = /\/(likelihood|color_by_aspect)\//;
+
 export class Loader {
-  constructor(files, changed) {
+  constructor(files, startWorker, changed) {
     this.files = files; // of a page that was saved: address → data URL
     this.changed = changed;
+    this.decoders = Array.from({ length: DECODES }, startWorker);
+    this.answers = new Map(); // address → what to do with its pixels
+    for (const each of this.decoders) each.onmessage = ({ data }) => this.answers.get(data.id)(data);
     this.blobs = new Map(); // address → Blob
-    this.bitmaps = new Map(); // address → ImageBitmap, least recently used first
+    this.bitmaps = new Map(); // address → { width, height, codes } or ImageBitmap (colours), least recently used first
     this.busy = new Map(); // address → "fetch" | "decode"
     this.failed = new Map(); // address → when
     this.wanted = []; // addresses to decode, the most wanted first
@@ -85,14 +90,28 @@ export class Loader {
     this.pump();
   }
 
+  // Levels as bytes, by a thread of their own; colours as the browser decodes them.
+  async pixels(a) {
+    if (COLOURS.test(a)) return createImageBitmap(this.blobs.get(a));
+    const decoder = this.decoders.shift(); // no more are busy than there are
+    this.decoders.push(decoder);
+    const answer = await new Promise((done) => {
+      this.answers.set(a, done);
+      decoder.postMessage({ do: "decode", id: a, blob: this.blobs.get(a) });
+    });
+    this.answers.delete(a);
+    if (!answer.codes) throw new Error(`${a} is no picture`);
+    return answer;
+  }
+
   async decode(a) {
     this.busy.set(a, "decode");
     try {
-      this.bitmaps.set(a, await createImageBitmap(this.blobs.get(a)));
+      this.bitmaps.set(a, await this.pixels(a));
       while (this.bitmaps.size > 2 * DECODED) {
         const [old, bitmap] = this.bitmaps.entries().next().value;
         this.bitmaps.delete(old);
-        bitmap.close();
+        bitmap.close?.();
       }
       this.changed();
     } catch {

@@ -17,6 +17,17 @@ export function inverse(A) {
   return [e / det, -b / det, (b * f - c * e) / det, -d / det, a / det, (c * d - a * f) / det];
 }
 
+// The canvas counts its six numbers by columns, the views by rows.
+const swapped = ([a, b, c, d, e, f]) => [a, c, e, b, d, f];
+const product = ([a, b, c, d, e, f], [p, q, r, s, t, u]) => [a * p + b * s, a * q + b * t, a * r + b * u + c, d * p + e * s, d * q + e * t, d * r + e * u + f];
+
+// Whole steps n from start, by step, that stay within 0 … end (end left out: its next pixel must be there).
+function within(start, step, end) {
+  if (!step) return start >= 0 && start < end ? [0, Infinity] : [1, 0];
+  const one = -start / step, other = (end - 1 - start) / step;
+  return [Math.ceil(Math.min(one, other)), Math.floor(Math.max(one, other))];
+}
+
 export class Panel {
   constructor(place, app, layer, label) {
     this.app = app;
@@ -125,18 +136,12 @@ export class Panel {
   }
 
   draw() {
-    const { app, slider } = this, canvas = slider.picture, g = canvas.getContext("2d", { alpha: false, willReadFrequently: true });
+    const { app, slider } = this, canvas = slider.picture, g = canvas.getContext("2d", { alpha: false });
     if (!slider.side) return;
     const found = this.find(), { about, bitmap, view } = found, k = canvas.width / slider.side, half = canvas.width / 2;
     this.found = found;
     g.setTransform(1, 0, 0, 1, 0, 0);
     g.globalCompositeOperation = "source-over";
-    g.fillStyle = "#000";
-    g.fillRect(0, 0, canvas.width, canvas.width);
-    const circle = new Path2D();
-    circle.arc(half, half, this.radius * k, 0, 7);
-    g.save();
-    g.clip(circle);
     const T = this.ground(view);
     const onto = (A) => {
       const [a, b, c, d, e, f] = inverse(A); // pixel → ground
@@ -145,28 +150,24 @@ export class Panel {
         T[0] * c + T[2] * f + T[4], T[1] * c + T[3] * f + T[5],
       );
     };
-    if (bitmap) {
-      onto(about.A);
-      g.imageSmoothingEnabled = true;
-      g.drawImage(bitmap, -0.5, -0.5);
-      g.setTransform(1, 0, 0, 1, 0, 0);
-      if (this.layer !== "likelihood" && this.layer !== "color_by_aspect") this.window(g, half, k);
+    if (bitmap?.codes) this.levels(g, bitmap, product(about.A, inverse(swapped(T))), this.radius * k);
+    else {
+      g.fillStyle = "#000";
+      g.fillRect(0, 0, canvas.width, canvas.width);
+      if (bitmap) {
+        onto(about.A);
+        g.drawImage(bitmap, -0.5, -0.5);
+      }
     }
     if (view && app.state.contour) this.outline(g, onto, view);
     if (view && app.state.cast) this.castOf(g, onto, view);
     g.setTransform(1, 0, 0, 1, 0, 0);
     this.furniture(g, T, view, k, half);
-    g.restore();
-    g.fillStyle = "#12181d"; // last: levels are set in the square round the circle
-    circle.rect(0, 0, canvas.width, canvas.width);
-    g.fill(circle, "evenodd");
-    if (this.layer === "color_by_aspect") this.wheel(g, view, k);
     this.describe(found, view);
   }
 
-  // Levels from lo to hi dB become black to white. By table on the pixels as they lie on the screen: of a canvas
-  // in main memory that is cheaper than blending twice.
-  window(g, half, k) {
+  // Grey of each level: from lo to hi dB it goes from black to white.
+  get grey() {
     const { low_db, step_db } = this.app.scene.codes, { top, range } = this.app.state;
     const code = (db) => Math.min(254, Math.max(1, (db - low_db) / step_db + 1));
     const hi = code(top), lo = code(top - range), name = `${lo} ${hi}`;
@@ -177,10 +178,33 @@ export class Panel {
       });
       this.table = { name, grey };
     }
-    const { grey } = this.table, r = Math.ceil(this.radius * k), from = Math.max(0, Math.floor(half - r)), side = 2 * r + 1;
-    const part = g.getImageData(from, from, side, side), pixels = new Uint32Array(part.data.buffer);
-    for (let i = 0; i < pixels.length; i++) pixels[i] = grey[pixels[i] & 255];
-    g.putImageData(part, from, from);
+    return this.table.grey;
+  }
+
+  // Levels where the screen wants them, between their four neighbours, as greys. M: canvas → picture pixels.
+  levels(g, { codes, width, height }, [a, b, c, d, e, f], radius) {
+    const side = g.canvas.width, half = side / 2, { grey } = this;
+    if (this.screen?.width !== side) this.screen = new ImageData(side, side);
+    const out = new Uint32Array(this.screen.data.buffer).fill(0xff000000);
+    const first = Math.max(0, Math.floor(half - radius)), last = Math.min(side - 1, Math.ceil(half + radius));
+    // In 1/65536 pixels: whole numbers are what makes this fast.
+    const [a1, d1] = [a, d].map((n) => Math.round(n * 65536)), [right, below] = [(width - 1) * 65536, (height - 1) * 65536];
+    for (let y = first; y <= last; y++) {
+      const reach = Math.sqrt(Math.max(0, radius * radius - (y + 0.5 - half) ** 2)) + 1;
+      const x0 = Math.max(0, Math.floor(half - reach)), x1 = Math.min(side - 1, Math.ceil(half + reach));
+      const u0 = Math.round((a * (x0 + 0.5) + b * (y + 0.5) + c) * 65536), v0 = Math.round((d * (x0 + 0.5) + e * (y + 0.5) + f) * 65536);
+      const [uFrom, uTo] = within(u0, a1, right), [vFrom, vTo] = within(v0, d1, below);
+      const from = Math.max(0, uFrom, vFrom), to = Math.min(x1 - x0, uTo, vTo);
+      if (from > to) continue;
+      let u = u0 + a1 * from, v = v0 + d1 * from;
+      for (let at = y * side + x0 + from, end = y * side + x0 + to; at <= end; at++, u = (u + a1) | 0, v = (v + d1) | 0) {
+        const i = ((v >> 16) * width + (u >> 16)) | 0, p = (u >> 8) & 255, q = (v >> 8) & 255;
+        const one = codes[i], two = codes[i + width];
+        const upper = ((one << 8) + (codes[i + 1] - one) * p) | 0, lower = ((two << 8) + (codes[i + width + 1] - two) * p) | 0;
+        out[at] = grey[((upper << 8) + (lower - upper) * q) >> 16];
+      }
+    }
+    g.putImageData(this.screen, 0, 0);
   }
 
   outline(g, onto, view) {
@@ -253,18 +277,6 @@ export class Panel {
     }
   }
 
-  wheel(g, view, k) {
-    // Hue by aspect, as the picture has it.
-    const r = 24 * k, x = this.slider.picture.width - r - 6 * k, y = r + 6 * k;
-    const turn = this.app.state.orientation === "sonar" && view ? (view.aspect_deg - 90) * RAD : 0;
-    for (let d = 0; d < 360; d += 3) {
-      g.beginPath(); g.moveTo(x, y);
-      g.arc(x, y, r, -(d + 3.5) * RAD + turn, -d * RAD + turn);
-      g.fillStyle = `hsl(${d} 100% 50%)`; g.fill();
-    }
-    g.beginPath(); g.arc(x, y, r * 0.45, 0, 7); g.fillStyle = "#12181d"; g.fill();
-  }
-
   describe(found, view) {
     const { app } = this, name = this.layer;
     let text = "";
@@ -276,6 +288,9 @@ export class Panel {
     if (this.note.textContent !== note) this.note.textContent = note;
     const views = app.views(this.isView && app.views(name).length ? name : app.guide);
     const shown = found.view ? views.findIndex((v) => v.stamp === found.view.stamp) : -1;
+    // Hue by aspect, as the picture has it.
+    const turn = app.state.orientation === "sonar" && view ? view.aspect_deg - 90 : 0;
+    this.slider.wheel = name === "color_by_aspect" ? turn : undefined;
     this.slider.show(app.aspectsOf(views), app.stepOf(views), shown >= 0 ? shown : app.nearestOf(views));
   }
 }

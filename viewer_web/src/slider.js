@@ -6,6 +6,7 @@ export class CsasSlider extends HTMLElement {
   aspects = []; // degrees, ascending, of the views that are there
   step = 1; // degrees between them
   index = -1;
+  wheel = undefined; // degrees that the wheel of hues is turned by; undefined: there is none
 
   connectedCallback() {
     if (this.picture) return;
@@ -98,8 +99,8 @@ export class CsasSlider extends HTMLElement {
 
   show(aspects, step, index) {
     const same = this.aspects === aspects && this.step === step;
-    if (same && this.index === index) return;
-    Object.assign(this, { aspects, step, index });
+    if (same && this.index === index && this.wheel === this.shownWheel) return;
+    Object.assign(this, { aspects, step, index, shownWheel: this.wheel });
     if (index >= 0) {
       this.setAttribute("aria-valuenow", aspects[index].toFixed(2).replace(/\.?0+$/, ""));
       this.setAttribute("aria-valuetext", `aspect ${aspects[index].toFixed(1)} degrees`);
@@ -117,6 +118,7 @@ export class CsasSlider extends HTMLElement {
     }
     g.clearRect(0, 0, size, size);
     g.drawImage(this.background, 0, 0);
+    if (this.wheel !== undefined) this.drawWheel(g, size, k);
     if (this.index < 0) return;
     const a = (this.aspects[this.index] / 360) * TAU;
     g.beginPath();
@@ -128,7 +130,28 @@ export class CsasSlider extends HTMLElement {
     g.stroke();
   }
 
+  drawWheel(g, size, k) {
+    const r = 24 * k, x = size - r - 6 * k, y = r + 6 * k;
+    for (let d = 0; d < 360; d += 3) {
+      g.beginPath();
+      g.moveTo(x, y);
+      g.arc(x, y, r, ((this.wheel - d - 3.5) / 360) * TAU, ((this.wheel - d) / 360) * TAU);
+      g.fillStyle = `hsl(${d} 100% 50%)`;
+      g.fill();
+    }
+    g.beginPath();
+    g.arc(x, y, r * 0.45, 0, TAU);
+    g.fillStyle = "#12181d";
+    g.fill();
+  }
+
   drawCircle(g, size, k) {
+    // What lies outside of the picture's disc covers the picture: cheaper than clipping that, every time.
+    g.fillStyle = "#12181d";
+    g.beginPath();
+    g.rect(0, 0, size, size);
+    g.arc(size / 2, size / 2, this.disc * k, 0, TAU);
+    g.fill("evenodd");
     g.translate(size / 2, size / 2);
     g.lineWidth = 5 * k;
     g.strokeStyle = "#2a343c"; // no view here (yet)
