@@ -35,8 +35,8 @@ from csas_shadow_ros.viewer.store import Entry, ViewStore
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "viewer"))
 from browser import ARGUMENTS, Watched, launched
 
-#: The tests have pages drawn by an emulated GPU, so that they take the ways that a real one takes. The browser by
-#: itself does not do that: without a GPU it draws pages in main memory, and emulates for 3-D alone.
+#: The tests have pages drawn by an emulated GPU, so that they take the ways that a real one takes. The
+#: browser by itself does not: without a GPU it draws pages in main memory, and emulates one for 3-D alone.
 ARGUMENTS.remove("--use-angle=swiftshader")
 
 VIEWS, SIDE, SECONDS = 360, 800, 6.0
@@ -46,7 +46,7 @@ DRAGS = 5
 
 
 def speckle(rng: np.random.Generator) -> NDArray[np.float32]:
-    """Return amplitudes whose speckle is as wide as that of views (their pixels are closer than they resolve)."""
+    """Return amplitudes with speckle as wide as that of views, whose pixels are closer than they resolve."""
     parts = (cv2.GaussianBlur(rng.normal(size=(SIDE, SIDE)), (0, 0), 1.2) for _ in range(2))
     return np.hypot(*parts).astype(np.float32)
 

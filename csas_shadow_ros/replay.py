@@ -20,10 +20,9 @@ from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from .bags import read_run
@@ -38,6 +37,9 @@ from .core.threshold import thresholded
 from .core.volume import VoxelGrid
 from .nodes.params import NODES, check, yaml_text
 from .nodes.playing import recorded_streams, stage_of_bag
+
+if TYPE_CHECKING:
+    import trimesh
 
 PACKAGE = "csas_shadow_ros"
 #: Stages of a bag, and the nodes that turn each into the next.

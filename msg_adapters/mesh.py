@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 
 from csas_shadow_ros.core.errors import AdapterError
 
 from .messages import MessageFactory, check_frame, check_type, make_header, point
 from .topics import MARKER
+
+if TYPE_CHECKING:
+    import trimesh
 
 TRIANGLE_LIST = 11
 ADD, DELETE, DELETE_ALL = 0, 2, 3
@@ -121,4 +123,6 @@ def mesh_from_msg(msg: Any) -> trimesh.Trimesh | None:
         bad = int(np.flatnonzero(~np.isfinite(corners).all(axis=1))[0])
         raise AdapterError(f"{where}.points[{bad}] is {corners[bad].tolist()}; expected finite metres")
     vertices, index = np.unique(corners, axis=0, return_inverse=True)
+    import trimesh  # late: it takes longer to import than all else here
+
     return trimesh.Trimesh(vertices, index.reshape(-1, 3), process=False)

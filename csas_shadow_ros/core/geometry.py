@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import rq
 
 from .errors import GeometryError, ParameterError, TrackError, check_range
 
@@ -352,6 +351,8 @@ class ShadowCamera:
         K, R : ndarray, shape (3, 3)
             What ``CameraInfo.k`` and ``.r`` carry.
         """
+        from scipy.linalg import rq  # late: few ask for it
+
         k, r = rq(self.projection[:, :3])
         signs = np.diag(np.where(np.diag(k) < 0, -1.0, 1.0))
         k, r = k @ signs, signs @ r

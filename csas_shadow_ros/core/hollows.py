@@ -20,10 +20,10 @@ import math
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.ndimage
-import trimesh
 from numpy.typing import NDArray
 
 from .echo import count_looks, layover_per_metre
@@ -31,6 +31,9 @@ from .geometry import ViewInfo
 from .likelihood import Levels, box_mean
 from .mesh import mesh_from_grid
 from .volume import Volume, VoxelGrid
+
+if TYPE_CHECKING:
+    import trimesh
 
 BoolArray = NDArray[np.bool_]
 

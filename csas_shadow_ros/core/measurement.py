@@ -19,12 +19,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import scipy.ndimage
-import trimesh
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
@@ -33,6 +32,9 @@ from .geometry import TWO_PI, View, ViewInfo, cross_range_axis, down_range_axis
 from .likelihood import Levels
 from .mesh import Dimensions, measure
 from .volume import VoxelGrid
+
+if TYPE_CHECKING:
+    import trimesh
 
 FloatArray = NDArray[np.float64]
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
-from skimage.measure import marching_cubes
 
 from .errors import NoTargetError
 from .volume import VoxelGrid
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 def surface_field(grid: VoxelGrid) -> NDArray[np.float32]:
@@ -60,6 +62,10 @@ def mesh_from_grid(grid: VoxelGrid) -> trimesh.Trimesh:
     NoTargetError
         If the grid holds no object.
     """
+    # Late: half a second that every process of the node graph, and the viewer, would wait for.
+    import trimesh
+    from skimage.measure import marching_cubes
+
     if not grid.occupied.any():
         raise NoTargetError("the grid holds no object; expected at least one occupied voxel to mesh")
     d = grid.volume.voxel_size_m

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.ndimage
-import trimesh
 from numpy.typing import NDArray
 
 from .carving import Carver, part_around
@@ -30,6 +30,9 @@ from .shadow import enhance
 from .target import Search, Target, stands_on_seabed
 from .threshold import LEAST_VOXELS
 from .volume import Volume, VoxelGrid
+
+if TYPE_CHECKING:
+    import trimesh
 
 #: Bodies carved if nothing else is asked for, the target among them. Each further one takes about half
 #: of the target's time.

@@ -10,9 +10,9 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from .carving import Carver
@@ -39,6 +39,9 @@ from .subaperture import Spectrum, SubApertures
 from .target import SignEvidence, Target, choose_target, find_target_and_others, spectrum_sign_evidence
 from .threads import in_order
 from .volume import Volume, VoxelGrid
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True, eq=False)

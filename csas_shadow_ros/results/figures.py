@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import matplotlib as mpl
@@ -28,25 +28,18 @@ from ..core.carving import MASK_COVERED, MASK_SHADOW, MASK_UNKNOWN
 from ..core.errors import CsasError
 from ..core.geometry import (
     TWO_PI,
-    CoherentImage,
     GroundGrid,
-    Track,
     View,
     unit_to_sonar,
-    wrap_angle,
 )
-from ..core.likelihood import Levels
 from ..core.mesh import surface_field
-from ..core.parameters import PipelineParameters
-from ..core.pipeline import Result
 from ..core.shadow import enhance
 from ..core.subaperture import Spectrum, SubApertures
 from ..core.volume import VoxelGrid
+from .subject import SIX_ASPECTS_DEG, AnyView, Subject
 
 #: Levels shown, dB over the median.
 _DB_LOW, _DB_HIGH = -20.0, 20.0
-#: Aspects of the collections of six, degrees.
-SIX_ASPECTS_DEG = (20.0, 80.0, 140.0, 200.0, 260.0, 320.0)
 #: Aperture of figure 5's reduced sub-aperture, as in the paper.
 _REDUCED_DEG = 4.0
 #: More triangles than this are drawn from a coarser surface.
@@ -59,60 +52,6 @@ _STYLE: dict[str, Any] = {
     "figure.facecolor": "white",
     "image.interpolation": "nearest",
 }
-
-
-class AnyView(Protocol):
-    """A view with what is known of its stages: `ProcessedView` or `StagedView`."""
-
-    @property
-    def sub_aperture(self) -> View | None: ...
-    @property
-    def shadow(self) -> View | None: ...
-    @property
-    def levels(self) -> Levels | None: ...
-    @property
-    def likelihood(self) -> View | None: ...
-    @property
-    def mask(self) -> View | None: ...
-
-
-@dataclass(eq=False)
-class Keeper:
-    """Keeps the views that the figures show, of all that come by: those nearest to six aspects."""
-
-    aspects_deg: tuple[float, ...] = SIX_ASPECTS_DEG
-    kept: dict[float, tuple[float, AnyView]] = field(default_factory=dict)
-
-    def add(self, view: AnyView) -> None:
-        """Look at one view and keep it if it is the nearest so far to one of the aspects."""
-        any_stage = view.shadow or view.sub_aperture or view.likelihood or view.mask
-        if any_stage is None:
-            return
-        for aspect in self.aspects_deg:
-            off = abs(float(wrap_angle(any_stage.info.aspect_rad - math.radians(aspect))))
-            if off < math.pi / len(self.aspects_deg) and off < self.kept.get(aspect, (math.inf, view))[0]:
-                self.kept[aspect] = (off, view)
-
-    def views(self) -> list[AnyView]:
-        """Return what was kept, in order of aspect."""
-        return [self.kept[a][1] for a in self.aspects_deg if a in self.kept]
-
-    def of(self, stage: str) -> list[View]:
-        """Return the kept views of one stage."""
-        found = (getattr(view, stage) for view in self.views())
-        return [view for view in found if view is not None]
-
-
-@dataclass(frozen=True, eq=False)
-class Subject:
-    """What the figures are drawn of."""
-
-    result: Result
-    keeper: Keeper
-    parameters: PipelineParameters
-    image: CoherentImage | None = None
-    track: Track | None = None
-    truth: trimesh.Trimesh | None = None
 
 
 class _Missing(CsasError):

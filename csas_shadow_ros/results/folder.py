@@ -9,10 +9,9 @@ import shutil
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from ..bags import BagReader
@@ -22,9 +21,12 @@ from ..core.mesh import measure, mesh_from_grid
 from ..core.pipeline import Result
 from ..core.volume import Volume, VoxelGrid
 from .bag import ResultBag
-from .figures import AnyView, Keeper, Subject, draw_all
 from .report import FORMAT, Context, build_report, report_text, summary
+from .subject import AnyView, Keeper, Subject
 from .truth import score
+
+if TYPE_CHECKING:
+    import trimesh
 
 REPORT = "report.json"
 GRID = "grid.npz"
@@ -202,6 +204,8 @@ class ResultsWriter:
         left_out: dict[str, str] = {"all": "not asked for"}
         truth = context.truth
         if self._figures:
+            from .figures import draw_all  # late: what only looks at a folder needs no matplotlib
+
             subject = Subject(
                 result,
                 self._keeper,

@@ -24,8 +24,8 @@ from ..core.parameters import PipelineParameters
 from ..core.pipeline import Result, open_hollows
 from ..core.segmentation import require_silhouette
 from ..core.stages import StagedView, spread_views
-from .figures import SIX_ASPECTS_DEG
 from .folder import ResultsWriter
+from .subject import SIX_ASPECTS_DEG
 
 if TYPE_CHECKING:
     from ..replay import ReplayResult

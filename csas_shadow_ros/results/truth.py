@@ -6,16 +6,18 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import CsasError
 from ..core.mesh import Dimensions, measure
 from ..core.volume import Volume, VoxelGrid
 from ..simulation.hull import iou, shadow_hull, voxelise_truth
+
+if TYPE_CHECKING:
+    import trimesh
 
 #: Margin round the true target in which scores look for what was wrongly left standing, voxels.
 _MARGIN_VOXELS = 2
@@ -66,6 +68,8 @@ def read_truth(bag: str | Path) -> KnownTruth | None:
     stl, record_path = (base.with_name(f"{base.name}.truth.{kind}") for kind in ("stl", "json"))
     if not stl.exists():
         return None
+    import trimesh  # late: few bags have a truth beside them
+
     try:
         record = json.loads(record_path.read_text(encoding="utf-8")) if record_path.exists() else {}
         raw = stl.read_bytes()

@@ -267,9 +267,7 @@ class ViewerServer:
 
         body = await self._in_thread(work)
         name = f"attachment; filename={request.match_info['name']}.{kind}"
-        return web.Response(
-            body=body, content_type=_MESHES[kind], headers={"Content-Disposition": name}
-        )
+        return web.Response(body=body, content_type=_MESHES[kind], headers={"Content-Disposition": name})
 
     async def _make_reduced(self, _: web.Request) -> web.StreamResponse:
         def work() -> bool:

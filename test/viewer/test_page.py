@@ -16,6 +16,7 @@ import pytest
 import trimesh
 from synthetic import COUNT, code_of, entry
 
+from csas_shadow_ros.cli import main
 from csas_shadow_ros.core.mesh import mesh_from_grid
 from csas_shadow_ros.viewer.export import export_html
 from csas_shadow_ros.viewer.store import ViewStore
@@ -318,6 +319,98 @@ def test_picture_mesh_link_and_file_can_be_taken_away(watched, serve, run_store,
     page.goto("about:blank")
     watched.open(link)
     assert watched.js("[csas.state.aspect, csas.state.zoom]") == [45, 2]
+
+
+def test_every_key_of_the_help_does_what_it_says(watched, serve, run_store):
+    watched.open(serve(run_store))
+    watched.until("csas.volumes.main && csas.volumes.other")
+    page, js = watched.page, watched.js
+
+    def press(key: str) -> None:
+        page.keyboard.press(key)
+        watched.drawn()
+
+    page.keyboard.press("Tab")  # the first button: keys work wherever the focus is
+    step = 360 / js("csas.views('shadow').length")
+    for key, views in (("ArrowRight", 1), ("ArrowLeft", 0), ("Shift+ArrowRight", 10), ("Home", 0), ("End", -1)):
+        press(key)
+        assert js("csas.current.aspect_deg") == pytest.approx(views * step % 360), key
+    for key, expression, before, after in (
+        ("n", "csas.state.orientation", "north", "sonar"),
+        ("c", "csas.state.contour", True, False),
+        ("m", "csas.state.cast", False, True),
+        ("b", "csas.state.compare", False, True),
+        ("v", "csas.state.evidence", False, True),
+        ("k", "document.querySelector('#whole').checked", False, True),
+        ("r", "csas.state.ruling", False, True),
+    ):
+        assert js(expression) == before
+        press(key)
+        assert js(expression) == after, key
+        press(key)
+        assert js(expression) == before, key
+    press("+")
+    assert js("csas.state.zoom") == pytest.approx(1.25)
+    centre = js("csas.state.centre")
+    press("Alt+ArrowRight")
+    assert js("csas.state.centre[0]") > centre[0]
+    press("Alt+ArrowUp")
+    assert js("csas.state.centre[1]") > centre[1]
+    press("-")
+    assert js("csas.state.zoom") == pytest.approx(1.0)
+    press("0")
+    assert js("[csas.state.zoom, ...csas.state.centre]") == [1, 0, 0]
+    span, top = js("[csas.state.range, csas.state.top]")
+    for key, wanted in (
+        ("BracketRight", [span + 2, top]),
+        ("BracketLeft", [span, top]),
+        ("Shift+BracketRight", [span, top + 1]),
+        ("Shift+BracketLeft", [span, top]),
+    ):
+        press(key)
+        assert js("[csas.state.range, csas.state.top]") == wanted, key
+    for number, layer in enumerate(js("[...csas.panels[0].select.options].map(o => o.value)"), start=1):
+        if layer == "reduced":
+            continue  # asks the server for what a run without its image has not
+        press(f"Digit{number}")
+        press(f"Shift+Digit{number}")
+        assert js("csas.panels.map(p => p.layer)") == [layer, layer]
+    press("r")
+    before = js("csas.state.ruler[1]")
+    press("ArrowRight")
+    assert js("csas.state.ruler[1][0]") > before[0]
+    press("t")
+    surfaces, threshold = js("[csas.stats.surfaces.length, +document.activeElement.value]")
+    press("ArrowRight")
+    assert js("+document.activeElement.value") > threshold
+    watched.until(f"csas.stats.surfaces.length > {surfaces}")
+
+
+def test_two_fingers_come_closer(watched, serve):
+    watched.open(serve(store_of()))
+    touch = watched.page.context.new_cdp_session(watched.page)
+    x, y = middle(watched)
+
+    def fingers(kind: str, apart: int) -> None:
+        points = [{"x": x + side * apart, "y": y, "id": (side + 1) // 2} for side in (-1, 1)]
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points if apart else []})
+
+    fingers("touchStart", 20)
+    for apart in range(25, 61, 5):
+        fingers("touchMove", apart)
+    fingers("touchEnd", 0)
+    watched.drawn()
+    assert watched.js("csas.state.zoom") == pytest.approx(3.0, rel=0.05)
+    held = watched.js("csas.state.centre")
+    assert held == pytest.approx([0, 0], abs=0.2 * watched.js("csas.sceneRadius"))
+
+
+def test_the_command_line_writes_a_page_that_opens_without_a_server(watched, results, run_store, tmp_path):
+    path = tmp_path / "run.html"
+    assert main(["view", str(results), "--html", str(path), "--every", "6", "-q"]) == 0
+    watched.open(path.as_uri())
+    assert watched.js("csas.views('shadow').length") == math.ceil(len(run_store.sets["shadow"]) / 6)
+    watched.until("csas.panels.every(p => p.found?.bitmap && !p.found.late)")
 
 
 def test_one_html_file_opens_without_a_server(watched, run_store, tmp_path):
