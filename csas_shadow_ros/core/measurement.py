@@ -51,6 +51,8 @@ _BULGE_PX = 0.8
 _BULGE_WITHIN = 0.8
 #: Fewer rows than this give no edge.
 _MIN_ROWS = 8
+#: What a side of a silhouette may be: as far out at every range, drawn in upwards, or out in its middle.
+SHAPES = ("straight", "tapering", "round")
 #: Directions that a plan's sides may face, and looks over an aperture.
 _DIRECTIONS, _LOOKS = 120, 9
 #: A side that holds this share of the outline gets finer directions round it: so many, so far apart (rad).
@@ -91,15 +93,22 @@ class SilhouetteSides:
     direction_rad : tuple of float
         Directions φ on the ground of the sides that were found, none to two.
     support_m : tuple of float
-        The plan's support in these directions, mean over the aperture: the largest p · (cos φ, sin φ), m.
+        The plan's support in these directions, mean over the aperture: the largest p · (cos φ, sin φ), m, as
+        this view alone tells it.
     tip_m : float
         Down-range e_r · p of the shadow's far end, m.
+    shapes : tuple of str
+        Which of `SHAPES` each side seems to be in this view alone; empty where nobody looked.
+    support_by_shape_m : tuple of tuple of float
+        The support of each side if it is of each of `SHAPES`, m; NaN where it cannot be.
     """
 
     info: ViewInfo
     direction_rad: tuple[float, ...]
     support_m: tuple[float, ...]
     tip_m: float
+    shapes: tuple[str, ...] = ()
+    support_by_shape_m: tuple[tuple[float, ...], ...] = ()
 
 
 def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) -> SilhouetteSides | None:
@@ -135,17 +144,20 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
     last = cols - 1 - shadow[rows][:, ::-1].argmax(axis=1).astype(np.float64)
     outside = _OUTSIDE_CELLS * info.resolution_m[1] if math.isfinite(info.focus_range_m) else 0.0
     e_c = cross_range_axis(info.aspect_rad)
-    directions, supports = [], []
+    directions, supports, shapes = [], [], []
     for sign, edge in ((1, last), (-1, first)):
         found = _side(levels, rows, sign * (edge - u0) * scale, scale, sign, (u0, v0))
         if found is None:
             continue
-        out, straight = found
+        out, shape = found
         axis = sign * e_c
         directions.append(math.atan2(axis[1], axis[0]))
-        supports.append(float(out * col_m - outside * straight + axis @ np.asarray(target_m)))
+        here = float(axis @ np.asarray(target_m))
+        supports.append(tuple(out[name] * col_m - outside * (name == "straight") + here for name in SHAPES))
+        shapes.append(shape)
     tip = info.down_range_of_rows()[rows[-1]] + row_m / 2.0
-    return SilhouetteSides(info, tuple(directions), tuple(supports), float(tip))
+    own = tuple(each[SHAPES.index(shape)] for each, shape in zip(supports, shapes, strict=True))
+    return SilhouetteSides(info, tuple(directions), own, float(tip), tuple(shapes), tuple(supports))
 
 
 def levels_of_mask(mask: View) -> Levels:
@@ -173,8 +185,9 @@ def _side(
     scale: FloatArray,
     sign: int,
     target_px: tuple[float, float],
-) -> tuple[float, bool] | None:
-    """Return how far out a side reaches (pixels from column u0, at the target's range); if it is straight.
+) -> tuple[dict[str, float], str] | None:
+    """Return how far out a side reaches (pixels from column u0, at the target's range) if it is of each of
+    `SHAPES`, and which it seems to be.
 
     None where too little of it is seen.
     """
@@ -185,29 +198,45 @@ def _side(
         return None
     rows, out_px, scale = rows[kept], out_px[kept], scale[kept]
     u0, v0 = target_px
-    along = rows - rows.mean()
-    curve, straight, slope = _fitted_side(along, out_px)
-    # The mean profile across the edge, rows laid over one another along the fitted side.
-    steps = np.arange(-_HALF_PX, _HALF_PX + 1)
-    columns = np.round(u0 + sign * (curve[:, None] + steps) / scale[:, None]).astype(np.intp)
-    inside = (columns >= 0) & (columns < levels.power.shape[1])
-    offsets = sign * (columns - u0) * scale[:, None] - curve[:, None]
-    columns = np.clip(columns, 0, levels.power.shape[1] - 1)
-    known = levels.known[rows[:, None], columns] & inside
-    if not known.any(axis=0).all():
-        return None
-    power = np.where(known, levels.power[rows[:, None], columns], 0.0).sum(axis=0) / known.sum(axis=0)
-    shadow_power = 1.0 / levels.contrast**2
-    dark = np.clip((1.0 - power) / (1.0 - shadow_power), -0.5, 1.2)
-    edge = -_HALF_PX - 0.5 + float(dark.sum()) + float((offsets - steps).mean())
+    curves, shape, slope = _fitted_side(rows - rows.mean(), out_px)
     # The target's echo hides the foot of a side that is drawn in upwards: its shadow would begin at the
     # target's own range.
     hidden = min(max(0.0, float(rows[0]) - v0), float(rows[-1] - rows[0]))
-    return float(curve.max()) + max(0.0, -slope) * hidden + edge, straight
+    out = dict.fromkeys(SHAPES, math.nan)
+    for name, curve in curves.items():
+        foot = max(0.0, -slope) * hidden if name == "tapering" else 0.0
+        out[name] = float(curve.max()) + foot + _edge_beyond(levels, rows, scale, sign * curve, sign, u0)
+    return None if math.isnan(out[shape]) else (out, shape)
 
 
-def _fitted_side(along: FloatArray, out_px: FloatArray) -> tuple[FloatArray, bool, float]:
-    """Fit a side: straight along range, else tapering, else round; say if it is straight, and its taper."""
+def _edge_beyond(
+    levels: Levels,
+    rows: NDArray[np.intp],
+    scale: FloatArray,
+    curve: FloatArray,
+    sign: int,
+    u0: float,
+) -> float:
+    """Return how far outside of a fitted side (columns from u0, at the target's range) its edge lies, pixels.
+
+    From the mean profile across the edge, rows laid over one another along the side; NaN where unknown.
+    """
+    steps = sign * np.arange(-_HALF_PX, _HALF_PX + 1)
+    columns = np.round(u0 + (curve[:, None] + steps) / scale[:, None]).astype(np.intp)
+    inside = (columns >= 0) & (columns < levels.power.shape[1])
+    offsets = sign * ((columns - u0) * scale[:, None] - curve[:, None])
+    columns = np.clip(columns, 0, levels.power.shape[1] - 1)
+    known = levels.known[rows[:, None], columns] & inside
+    if not known.any(axis=0).all():
+        return math.nan
+    power = np.where(known, levels.power[rows[:, None], columns], 0.0).sum(axis=0) / known.sum(axis=0)
+    shadow_power = 1.0 / levels.contrast**2
+    dark = np.clip((1.0 - power) / (1.0 - shadow_power), -0.5, 1.2)
+    return -_HALF_PX - 0.5 + float(dark.sum()) + float((offsets - sign * steps).mean())
+
+
+def _fitted_side(along: FloatArray, out_px: FloatArray) -> tuple[dict[str, FloatArray], str, float]:
+    """Fit a side with each of `SHAPES` that it may have; say which it seems to be, and its taper."""
     weight = np.ones_like(out_px)
     slope = level = 0.0
     for _ in range(5):
@@ -221,13 +250,35 @@ def _fitted_side(along: FloatArray, out_px: FloatArray) -> tuple[FloatArray, boo
     reach = max(float(np.abs(along).max()), 1.0)
     design = np.stack([np.ones_like(along), along / reach, (along / reach) ** 2], axis=1)
     bend, *_ = np.linalg.lstsq(design * weight[:, None], out_px * weight, rcond=None)
-    curve = design @ bend
-    within = bend[2] < 0.0 and abs(bend[1] / (2.0 * bend[2])) < _BULGE_WITHIN
-    if within and float(curve.max()) - mean > _BULGE_PX:
-        return np.asarray(curve), False, 0.0
-    if abs(slope) * float(np.ptp(along)) >= _TAPER_PX:
-        return np.asarray(level + slope * along), False, slope
-    return np.full_like(out_px, mean), True, 0.0
+    curves = {"straight": np.full_like(out_px, mean), "tapering": np.asarray(level + slope * along)}
+    shape = "tapering" if abs(slope) * float(np.ptp(along)) >= _TAPER_PX else "straight"
+    if bend[2] < 0.0 and abs(bend[1] / (2.0 * bend[2])) < _BULGE_WITHIN:
+        curves["round"] = np.asarray(design @ bend)
+        if float(curves["round"].max()) - mean > _BULGE_PX:
+            shape = "round"
+    return curves, shape, slope
+
+
+def _agreed_support(sides: Sequence[SilhouetteSides]) -> FloatArray:
+    """Return the supports of all sides, each taken for the shape that most sides beside it seem to have.
+
+    Speckle roughens edges, so that one view alone is wrong about a side in six, and a straight side that is
+    taken for a round one is measured 2 cm too far out. Views within half an aperture look at the same side.
+    """
+    own = np.array([support for side in sides for support in side.support_m], dtype=np.float64)
+    told = [shape for side in sides for shape in side.shapes]
+    if len(told) != len(own):
+        return own  # of a program that does not tell shapes
+    shape = np.array([SHAPES.index(name) for name in told], dtype=np.intp)
+    by_shape = np.array([each for side in sides for each in side.support_by_shape_m]).reshape(-1, len(SHAPES))
+    phi = np.array([angle for side in sides for angle in side.direction_rad])
+    half = np.array([side.info.aperture_rad / 2.0 for side in sides for _ in side.direction_rad])
+    beside = np.abs(np.mod(phi[:, None] - phi[None, :] + math.pi, TWO_PI) - math.pi) <= half[:, None] + 1e-9
+    votes = beside.astype(np.float64) @ np.eye(len(SHAPES))[shape]
+    # What a view alone says breaks a tie.
+    votes[np.arange(len(shape)), shape] += 0.5
+    agreed = by_shape[np.arange(len(shape)), votes.argmax(axis=1)]
+    return np.where(np.isnan(agreed), own, agreed)
 
 
 class PlanFit:
@@ -255,11 +306,12 @@ class PlanFit:
 
     def __init__(self, sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> None:
         pairs = [
-            (phi, support, side.info.aperture_rad, index)
+            (phi, math.nan, side.info.aperture_rad, index)
             for index, side in enumerate(sides)
-            for phi, support in zip(side.direction_rad, side.support_m, strict=True)
+            for phi in side.direction_rad
         ]
         seen = np.array(pairs, dtype=np.float64).reshape(-1, 4)
+        seen[:, 1] = _agreed_support(sides)
         self.directions: FloatArray = _round_circle(_FINE_DIRECTIONS)
         coarse = _round_circle(_DIRECTIONS)
         own = _voxel_support(grid, coarse)

@@ -30,6 +30,7 @@ from csas_shadow_ros.core.carving import (
 from csas_shadow_ros.core.echo import echo_zone, opaque_part
 from csas_shadow_ros.core.geometry import View
 from csas_shadow_ros.core.measurement import (
+    SHAPES,
     PlanFit,
     SilhouetteSides,
     cap_height,
@@ -131,6 +132,30 @@ def test_the_fit_undoes_the_mean_over_the_aperture(heading_deg):
         if abs(math.remainder(p - heading - math.pi / 2, math.pi)) < math.radians(2.1)
     )
     assert raw > 0.2 + 0.015
+
+
+def with_shapes(sides, true, wrong, told_wrong):
+    """Sides of one shape, which some views take for another one with a support that is 3 cm larger."""
+    out = []
+    for n, side in enumerate(sides):
+        told = wrong if told_wrong(n) else true
+        by_shape = tuple(
+            tuple(s if name == true else s + 0.03 for name in SHAPES) for s in side.support_m
+        )
+        own = tuple(each[SHAPES.index(told)] for each in by_shape)
+        out.append(replace(side, support_m=own, shapes=(told, told), support_by_shape_m=by_shape))
+    return out
+
+
+@pytest.mark.parametrize(("true", "wrong"), [("straight", "round"), ("round", "tapering")])
+def test_a_view_that_is_alone_in_what_it_takes_a_side_for_is_outvoted(true, wrong):
+    occupied = hull_of(BOX, INFOS, VOLUME)
+    exact = drawn_sides(box_support(0.5, 0.3))
+    told = with_shapes(exact, true, wrong, lambda n: n % 6 == 0)
+    assert widths(PlanFit(told, grid_of(occupied))) == pytest.approx((0.5, 0.3), abs=0.006)
+    # Where most views say so, they are believed.
+    most = with_shapes(exact, true, wrong, lambda n: n % 6 != 0)
+    assert widths(PlanFit(most, grid_of(occupied))) == pytest.approx((0.56, 0.36), abs=0.012)
 
 
 def test_the_carved_voxels_stand_in_where_an_arc_is_missing():
