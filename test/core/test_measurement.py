@@ -151,10 +151,10 @@ def with_shapes(sides, true, wrong, told_wrong):
 def test_a_view_that_is_alone_in_what_it_takes_a_side_for_is_outvoted(true, wrong):
     occupied = hull_of(BOX, INFOS, VOLUME)
     exact = drawn_sides(box_support(0.5, 0.3))
-    told = with_shapes(exact, true, wrong, lambda n: n % 6 == 0)
+    told = with_shapes(exact, true, wrong, lambda n: n % 3 == 0)
     assert widths(PlanFit(told, grid_of(occupied))) == pytest.approx((0.5, 0.3), abs=0.006)
     # Where most views say so, they are believed.
-    most = with_shapes(exact, true, wrong, lambda n: n % 6 != 0)
+    most = with_shapes(exact, true, wrong, lambda n: n % 3 != 0)
     assert widths(PlanFit(most, grid_of(occupied))) == pytest.approx((0.56, 0.36), abs=0.012)
 
 
