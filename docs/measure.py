@@ -5,8 +5,9 @@
     python docs/measure.py search [TARGET]  # target search and spectrum sign
     python docs/measure.py carve [TARGET]  # what enhancement, echo, support and threshold each do
     python docs/measure.py hollows [TARGET]  # what echoes tell of hollows, and two ways that were not taken
+    python docs/measure.py wrong [TARGET]   # what wrong geometry costs: the most that an estimate could gain
 
-Every run is of the `standard` profile, seed 1. `carve` and `hollows` use 180 views (2° steps); IoU is
+Every run is of the `standard` profile, seed 1, all but `fast` and `search` of 180 views (2° steps); IoU is
 against the shadow hull, the voxels that perfect silhouettes would leave, where nothing else is said.
 """
 
@@ -26,10 +27,10 @@ import scipy.ndimage
 import trimesh
 from numpy.typing import NDArray
 
-from csas_shadow_ros.core import reference, segmentation
+from csas_shadow_ros.core import likelihood, reference, segmentation
 from csas_shadow_ros.core.carving import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, Carver
 from csas_shadow_ros.core.echo import layover_per_metre
-from csas_shadow_ros.core.geometry import ShadowCamera, View, ViewInfo
+from csas_shadow_ros.core.geometry import ShadowCamera, Track, View, ViewInfo
 from csas_shadow_ros.core.hollows import EchoLook, _looks, _surface
 from csas_shadow_ros.core.likelihood import Levels, box_mean
 from csas_shadow_ros.core.parameters import (
@@ -45,7 +46,7 @@ from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.core.target import SignEvidence, Target, spectrum_sign_evidence
 from csas_shadow_ros.core.threshold import occupied_voxels, supported
 from csas_shadow_ros.core.volume import Volume, VoxelGrid
-from csas_shadow_ros.simulation import simulate
+from csas_shadow_ros.simulation import Faults, simulate
 from csas_shadow_ros.simulation.hull import iou, shadow_hull, voxelise_truth
 from csas_shadow_ros.simulation.scene import SceneModel
 from csas_shadow_ros.simulation.targets import box, cone, join_bodies
@@ -144,10 +145,35 @@ def _print_search(evidence: SignEvidence, best: Target | None, true_m: tuple[flo
     print(f"  target {math.hypot(*best.position_m):.2f} m off its place, volume {size} m for {true} m")
 
 
-#: What the segmentation does, each left out in turn.
-SEGMENTATION_WITHOUT: dict[str, dict[str, Any]] = {
-    "  square averaging box": {"_HALF_CELLS": (1.0, 1.0)},
-    "  far end not put back": {"_drawn_down": lambda dark, rows: dark},
+def _mixture(
+    power: NDArray[np.float32], known: NDArray[np.bool_], start_db: float
+) -> tuple[float, float] | None:
+    """Fit two exponentials to the powers of a view (Rayleigh amplitudes) by expectation-maximisation.
+
+    In place of `likelihood.fit_contrast`: refused where the contrast is more than 6 dB off the hypothesis, or
+    the shadow takes less than a thousandth of the view.
+    """
+    values = power[known][::7].astype(np.float64)
+    values = values[values < 6.0]  # the rest is echoes
+    share, shadow, seabed = 0.1, 10.0 ** (-start_db / 10.0), 1.0
+    for _ in range(100):
+        dark = share / shadow * np.exp(-values / shadow)
+        dark /= dark + (1.0 - share) / seabed * np.exp(-values / seabed)
+        share = float(dark.mean())
+        shadow = max(float((dark * values).sum() / dark.sum()), 1e-6)
+        seabed = float(((1.0 - dark) * values).sum() / (1.0 - dark).sum())
+    contrast_db = 10.0 * math.log10(seabed / shadow)
+    if abs(contrast_db - start_db) > 6.0 or share < 1e-3:
+        return None
+    return 10.0 ** (contrast_db / 20.0), share
+
+
+#: What segmentation and levels do, each left out or done otherwise in turn.
+VIEWS_WITHOUT: dict[str, tuple[Any, dict[str, Any]]] = {
+    "  square averaging box": (segmentation, {"_HALF_CELLS": (1.0, 1.0)}),
+    "  far end not put back": (segmentation, {"_drawn_down": lambda dark, rows: dark}),
+    "  contrast hypothesis alone": (likelihood, {"fit_contrast": lambda *_: None}),
+    "  levels by a mixture fit": (likelihood, {"fit_contrast": _mixture}),
 }
 
 
@@ -236,8 +262,8 @@ def carve(names: tuple[str, ...]) -> None:
         if bare.grid is None:
             raise SystemExit(f"nothing was found of {name} without enhancement")
         rows["no enhancement (consensus)"] = iou(bare.grid.occupied, hull)
-        for label, patch in SEGMENTATION_WITHOUT.items():
-            with patched(segmentation, **patch):
+        for label, (module, patch) in VIEWS_WITHOUT.items():
+            with patched(module, **patch):
                 views = run(made.image, made.track, _given(result.target))
             rows[label] = 0.0 if views.grid is None else iou(views.grid.occupied, hull)
         for label, value in rows.items():
@@ -366,6 +392,49 @@ def hollows(names: tuple[str, ...]) -> None:
         )
 
 
+def _reported(track: Track, tilt_deg: float = 0.0, offset_m: float = 0.0) -> Track:
+    """Return what a track reports over a seabed that is tilted along x, or lies deeper, unknown to it."""
+    positions = np.array(track.positions_m, dtype=np.float64)
+    positions[:, 2] -= offset_m + math.tan(math.radians(tilt_deg)) * positions[:, 0]
+    return Track(track.stamps_ns, positions)
+
+
+#: What is wrong with a run, and nothing else: faults of the simulation, and what the track reports.
+WRONG: dict[str, tuple[Faults, dict[str, float]]] = {
+    "nothing": (Faults(), {}),
+    "sound speed 1 % too high": (Faults(sound_speed_error=0.01), {}),
+    "sound speed 1 % too low": (Faults(sound_speed_error=-0.01), {}),
+    "seabed tilted by 1 deg": (Faults(), {"tilt_deg": 1.0}),
+    "seabed tilted by 2 deg": (Faults(), {"tilt_deg": 2.0}),
+    "seabed 0.5 m deeper": (Faults(), {"offset_m": 0.5}),
+    "seabed 1 m deeper": (Faults(), {"offset_m": 1.0}),
+    "phase error of 1 rad": (Faults(phase_error_rad=1.0), {}),
+}
+
+
+def wrong(names: tuple[str, ...]) -> None:
+    """Print IoU with the true geometry's shadow hull when the geometry that is told is wrong."""
+    print(f"{'IoU with the shadow hull':28}" + "".join(f"{n:>10}" for n in names) + "      mean   height")
+    for label, (faults, seabed) in WRONG.items():
+        found, heights = [], []
+        for name in names:
+            made = simulate("standard", name, seed=SEED, faults=faults)
+            parameters = PipelineParameters(sub_aperture=SubApertureParameters(step_deg=2.0))
+            result = run(made.image, _reported(made.track, **seabed), parameters)
+            if result.grid is None or result.dimensions is None:
+                found.append(0.0)
+                continue
+            every = max(1, len(made.truth.sonar_m) // 360)
+            hull = shadow_hull(made.truth.target, made.truth.sonar_m[::every], result.grid.volume)
+            found.append(iou(result.grid.occupied, hull))
+            heights.append(result.dimensions.height_m / made.truth.dims_m[2] - 1.0)
+        print(
+            f"{label:28}" + "".join(f"{value:10.3f}" for value in found) + f"{np.mean(found):10.3f}"
+            f"{100.0 * float(np.mean(heights or [math.nan])):+7.1f} %",
+            flush=True,
+        )
+
+
 def _largest(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
     labels, count = scipy.ndimage.label(dark, np.ones((3, 3, 3), bool))
     if not count:
@@ -378,8 +447,8 @@ def _largest(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def main(argv: list[str] | None = None) -> int:
     """Run one of the measurements."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("what", choices=("fast", "search", "carve", "hollows"))
-    parser.add_argument("target", nargs="*", help="for search, carve and hollows (default: all)")
+    parser.add_argument("what", choices=("fast", "search", "carve", "hollows", "wrong"))
+    parser.add_argument("target", nargs="*", help="for all but fast (default: all)")
     options = parser.parse_args(argv)
     if options.what == "fast":
         fast()
@@ -387,6 +456,8 @@ def main(argv: list[str] | None = None) -> int:
         search(tuple(options.target) or (*TARGETS, "empty"))
     elif options.what == "hollows":
         hollows(tuple(options.target) or (*HOLLOW, *SOLID))
+    elif options.what == "wrong":
+        wrong(tuple(options.target) or TARGETS)
     else:
         carve(tuple(options.target) or TARGETS)
     return 0
