@@ -393,7 +393,8 @@ def _add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
         "  csas-shadow run box_run --out quick --step-deg 5 --voxel-size-m 0.04 --no-bag\n"
         "  csas-shadow run box_run --out by_hand --position-m 0.5 -0.3 --size-m 2 2 0.8\n"
         "  csas-shadow run other_run --out flipped --spectrum-sign -1\n"
-        "  csas-shadow run views --out carved --start-from likelihood --target given --size-m 2 2 0.8\n\n"
+        "  csas-shadow run views --out carved --start-from likelihood --method soft --target given \\\n"
+        "      --size-m 2 2 0.8\n\n"
         "DIR holds grid.npz, mesh.stl .ply .obj .glb, report.json, summary.txt, result.mcap and figures/,\n"
         "and object_2.npz, object_2.stl and so on of what else stands on the seabed.\n"
         "A seabed without an object is a result like any other: it is said so, and the exit code is 0.",
@@ -646,7 +647,12 @@ def _bag_text(about: dict[str, Any]) -> str:
         size = _size(topic.get("bytes", 0))
         lines.append(f"  {name:<{width}}  {topic['messages']:>6}  {size:>9}  {topic['type']}")
     lines.append("")
-    if image := about["image"]:
+    sectors = about["sectors"]
+    if sectors:
+        lines.append(f"sectors {sectors['count']} that cover {sectors['covered_deg']:.1f} of 360°")
+        if sectors["missing"]:
+            lines.append(f"        missing: {', '.join(sectors['missing'][:8])}")
+    if image := about["image"] or (sectors and sectors["image"]):
         e = image["extent_m"]
         lines.append(
             f"image   {image['rows']} x {image['cols']} pixels of {image['spacing_m'] * 1e3:g} mm:"
@@ -672,7 +678,11 @@ def _bag_text(about: dict[str, Any]) -> str:
             + (f" {d['length_m']:.3f} x {d['width_m']:.3f} x {d['height_m']:.3f} m" if d else ": no object")
             + f" ({truth['mesh']})"
         )
-    starts = ", ".join(about["start_from"]) or "nothing: see `csas-shadow check`"
+    names = [
+        "image (summed from the sectors)" if name == "image" and about["image"] is None else name
+        for name in about["start_from"]
+    ]
+    starts = ", ".join(names) or "nothing: see `csas-shadow check`"
     lines.append(f"a run can start from: {starts}")
     lines += [f"problem: {problem}" for problem in about["problems"]]
     return "\n".join(lines)

@@ -10,10 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
+from msg_adapters.topics import absolute_name, stream
+
 from .bags import BagReader, Problem, Run, read_run
-from .bags.check import ERROR, judge_amplitude, judge_coverage, judge_image
+from .bags.check import ERROR, judge_amplitude, judge_coverage, judge_image, judge_sectors
+from .core.arcs import Arc, Arcs
 from .core.errors import BagError, CsasError, ParameterError, SpectrumSignError
 from .core.geometry import CoherentImage, Track, View
 from .core.objects import MAX_OBJECTS
@@ -162,16 +166,20 @@ def replay_bag(
         run = read_run(bag)
         context = Context(p, command, truth=read_truth(bag))
         image = None
+        stage = start_from
         if choose_start(run, start_from) == "image":
             image = run.coherent_image()
             refuse_contradictions(image, run.require_track(), notice)
+            if run.image is None:
+                stage = "sector"  # also where there is an image that cannot be used
+                tell_of_sectors(run, notice)
         context.timings_s["read"] = time.perf_counter() - began
         scratch = writer.work / ".replay"
         replayed = replay(
             bag,
             scratch,
             p,
-            stage=start_from,
+            stage=stage,
             rate=rate,
             record=True,
             overrides={"bag_recorder": {"compress": False}},
@@ -232,6 +240,8 @@ def _from_image(
     began = time.perf_counter()
     image, track = run.coherent_image(), run.require_track()
     refuse_contradictions(image, track, notice)
+    if run.image is None:
+        tell_of_sectors(run, notice)
     context.timings_s["read"] += time.perf_counter() - began
     sign = context.spectrum_sign_override
     if sign is not None:
@@ -325,6 +335,14 @@ def refuse_contradictions(image: CoherentImage, track: Track, notice: Notice = _
         notice(f"{level}: {problem}. {remedy}")
 
 
+def tell_of_sectors(run: Run, notice: Notice = _ignore) -> None:
+    """Tell of arcs that no sector covers, or two: as it goes, and in the report's problems."""
+    topic = absolute_name(stream("sector").image_topic, run.namespace)
+    for level, problem, remedy in judge_sectors(run, run.require_track()):
+        notice(f"{level}: {problem}. {remedy}")
+        run.report(Problem(topic, None, None, problem))
+
+
 def told_once(problems: Sequence[Problem]) -> list[str]:
     """Return problems as lines; what is wrong with many messages alike is one line."""
     alike: dict[tuple[str, str], list[Problem]] = {}
@@ -396,7 +414,26 @@ def describe_run(run: Run) -> dict[str, Any]:
         "checksums": reader.has_checksums,
         "metadata": _bag_metadata(run.path),
         "image": None if run.image is None else describe_image(run.image),
+        "sectors": describe_sectors(run),
         "track": None if track is None else describe_track(track),
+    }
+
+
+def describe_sectors(run: Run) -> dict[str, Any] | None:
+    """Describe the sectors of a bag by what they say of themselves; None if there is none."""
+    infos = run.sector_infos()
+    if not infos:
+        return None
+    arcs = Arcs()
+    for info in infos:
+        arcs.add(Arc(info.aspect_rad - info.aperture_rad / 2.0, info.aperture_rad))
+    first = infos[0]
+    blank = np.broadcast_to(np.complex64(0), first.grid.shape)
+    return {
+        "count": len(infos),
+        "covered_deg": math.degrees(arcs.covered_rad),
+        "missing": [str(arc) for arc in arcs.missing()],
+        "image": describe_image(CoherentImage(blank, first.grid, first.acoustics, first.stamp_ns)),
     }
 
 

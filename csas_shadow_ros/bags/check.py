@@ -15,7 +15,6 @@ import scipy.fft
 
 from csas_shadow_ros.core.errors import BagError, CsasError
 from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, Track, View
-from csas_shadow_ros.core.sector import Sector
 from msg_adapters.pairs import (
     coherent_image_from_msgs,
     ground_picture_from_msgs,
@@ -27,7 +26,7 @@ from msg_adapters.topics import STREAMS, TOPICS, VIEW_STREAMS, absolute_name
 from msg_adapters.track import track_from_msg
 
 from .bag import BagReader
-from .run import Problem, checked_messages, iterate_pairs
+from .run import Problem, Run, checked_messages, iterate_pairs, read_run
 
 ERROR, WARNING, INFO = "error", "warning", "info"
 
@@ -181,7 +180,9 @@ class _Check:
         """Turn what reading refused into a finding with a remedy."""
         relative = problem.topic.removeprefix(f"{self.reader.namespace}/")
         topic = TOPICS.get(relative)
-        if problem.number is None:
+        if problem.number is None and problem.stamp_ns is not None:
+            remedy = "Let all sectors share one grid and one band: they are added up."
+        elif problem.number is None:
             remedy = f"Publish {problem.topic} as {topic.type_name}." if topic else ""
         elif "of the same stamp" in problem.reason and "has no" in problem.reason:
             remedy = "Give an image and its camera_info the very same header.stamp, and record both topics."
@@ -260,8 +261,32 @@ class _Check:
                     self.say(level, pair.topic, problem, remedy, **place)
             for level, problem, remedy in self.judge(item):
                 self.say(level, pair.topic, problem, remedy, **place)
+        if usable and stream_name == "sector":
+            usable = self.check_sector_sum()
         if usable:
             self.report.usable[stream_name] = usable
+
+    def check_sector_sum(self) -> int:
+        """Judge the image that the sectors add up to; return how many of them it holds."""
+        run = read_run(self.reader.path, self.reader.namespace)
+        try:
+            total = run.sector_sum()
+        except CsasError:
+            return 0  # named one by one
+        finally:
+            topic = self.name("sector/image")
+            for problem in run.problems:
+                if problem.topic == topic:
+                    self.problem(problem)
+        if self.track is not None:
+            image = total.image()
+            for level, text, remedy in (
+                *judge_sectors(run, self.track),
+                *judge_image(image, self.track),
+                *check_spectrum_sign(image, self.track),
+            ):
+                self.say(level, topic, text, remedy)
+        return len(total.stamps)
 
     def judge(self, item: Any) -> Iterator[tuple[str, str, str]]:
         if self.track is None:
@@ -269,9 +294,6 @@ class _Check:
         if isinstance(item, CoherentImage):
             yield from judge_image(item, self.track)
             yield from check_spectrum_sign(item, self.track)
-        elif isinstance(item, Sector):
-            yield from judge_geometry(item.grid, self.track)
-            yield from judge_band(item.grid, item.acoustics, self.track)
         elif isinstance(item, View):
             yield from judge_view(item, self.track)
 
@@ -340,6 +362,36 @@ def judge_image(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, 
     yield from judge_geometry(image.grid, track)
     yield from judge_band(image.grid, image.acoustics, track)
     yield from judge_energy(image, track)
+
+
+def judge_sectors(run: Run, track: Track) -> Iterator[tuple[str, str, str]]:
+    """Yield (level, problem, remedy) for arcs that no sector covers, or that two say they are."""
+    # Late: it needs the FFT and the compiler.
+    from csas_shadow_ros.core.streaming import uncovered
+
+    total = run.sector_sum()
+    if arcs := uncovered(total.arcs, track):
+        named = ", ".join(str(arc) for arc in arcs[:8])
+        named += f" and {len(arcs) - 8} more" if len(arcs) > 8 else ""
+        missing = math.degrees(sum(arc.width_rad for arc in arcs))
+        yield (
+            WARNING,
+            f"no sectors came of {named}: {missing:.0f} of 360 degrees are missing",
+            "Views in these arcs see little or nothing, and the shape may be wrong: record every sector.",
+        )
+    infos = [info for info in run.sector_infos() if info.stamp_ns in total.stamps]
+    for n, info in enumerate(infos):
+        near = 0.01 * info.aperture_rad
+        for other in infos[:n]:
+            turn = abs(math.remainder(info.aspect_rad - other.aspect_rad, math.tau))
+            if turn <= near and abs(info.aperture_rad - other.aperture_rad) <= near:
+                yield (
+                    WARNING,
+                    f"sectors at {other.stamp_ns} ns and {info.stamp_ns} ns are of the same arc,"
+                    f" {math.degrees(info.aperture_rad):g} degrees round {math.degrees(info.aspect_rad):.1f}:"
+                    " it counts twice",
+                    "Give a sector that is sent again the stamp that it had: it then counts once.",
+                )
 
 
 def judge_amplitude(view: View) -> Iterator[tuple[str, str, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -10,7 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from csas_shadow_ros.core.errors import BagError, CsasError
 from csas_shadow_ros.core.geometry import CoherentImage, Track, View
-from csas_shadow_ros.core.sector import Sector
+from csas_shadow_ros.core.sector import Sector, same_band, same_grid
+from msg_adapters.camera_info import SectorInfo, sector_info_from_msg
 from msg_adapters.image import largest_part, quantise
 from msg_adapters.messages import RosbagsMessages, stamp_to_ns
 from msg_adapters.pairs import (
@@ -117,6 +119,10 @@ class Run:
         """Iterate the sectors."""
         return self._each("sector", sector_from_msgs)
 
+    def sector_infos(self) -> list[SectorInfo]:
+        """Return what the legible sectors say of themselves, each stamp once."""
+        return [] if self._reader is None else sector_infos(self._reader)
+
     def sector_sum(self) -> SectorSum:
         """Return the sum of the sectors; it is made once.
 
@@ -131,7 +137,11 @@ class Run:
         if self._sum is None:
             total = SectorSum()
             topic = absolute_name(stream("sector").image_topic, self.namespace)
+            odd = odd_sectors(self.sector_infos())
             for sector in self.sectors():
+                if sector.stamp_ns in odd:
+                    self.report(Problem(topic, None, sector.stamp_ns, odd[sector.stamp_ns]))
+                    continue
                 try:
                     total.add(sector)
                 except CsasError as error:
@@ -189,6 +199,40 @@ class Run:
         """Note a problem; the same one only once."""
         if problem not in self.problems:
             self.problems.append(problem)
+
+
+def sector_infos(reader: BagReader) -> list[SectorInfo]:
+    """Return what the legible sectors of a bag say of themselves, each stamp once."""
+    found: list[SectorInfo] = []
+    for _, message, _ in checked_messages(reader, "sector/camera_info", lambda _: None):
+        # What is not legible is named where the sectors are read.
+        with contextlib.suppress(CsasError):
+            found.append(sector_info_from_msg(message))
+    return found
+
+
+def odd_sectors(infos: Iterable[SectorInfo]) -> dict[int, str]:
+    """Return, by stamp, why a sector is not like most: one that is wrong must not make the others wrong."""
+    kinds: list[list[SectorInfo]] = []
+    for info in infos:
+        for kind in kinds:
+            if same_grid(kind[0].grid, info.grid) and same_band(kind[0].acoustics, info.acoustics):
+                kind.append(info)
+                break
+        else:
+            kinds.append([info])
+    if len(kinds) < 2:
+        return {}
+    most = max(kinds, key=len)
+    reasons: dict[int, str] = {}
+    for kind in kinds:
+        if kind is not most:
+            what = "band" if same_grid(most[0].grid, kind[0].grid) else "grid"
+            field_name = "grid" if what == "grid" else "acoustics"
+            own, expected = getattr(kind[0], field_name), getattr(most[0], field_name)
+            reason = f"has another {what} than {len(most)} other sectors: {own}; expected {expected}"
+            reasons |= {info.stamp_ns: reason for info in kind}
+    return reasons
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -67,6 +68,18 @@ def same_grid(a: GroundGrid, b: GroundGrid) -> bool:
     return a.shape == b.shape and all(
         abs(x - y) <= tolerance
         for x, y in ((a.spacing_m, b.spacing_m), (a.x_min_m, b.x_min_m), (a.y_max_m, b.y_max_m))
+    )
+
+
+def same_band(a: Acoustics, b: Acoustics) -> bool:
+    """Say whether two bands are the same, to a millionth: programs work them out anew for each sector."""
+    return a.spectrum_sign == b.spectrum_sign and all(
+        math.isclose(x, y, rel_tol=1e-6)
+        for x, y in (
+            (a.centre_frequency_hz, b.centre_frequency_hz),
+            (a.bandwidth_hz, b.bandwidth_hz),
+            (a.sound_speed_mps, b.sound_speed_mps),
+        )
     )
 
 

@@ -24,7 +24,7 @@ from .errors import GeometryError, NoTargetError, ViewError
 from .geometry import TWO_PI, CoherentImage, Track
 from .parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from .pipeline import ProcessedView, process_view
-from .sector import Sector, same_grid
+from .sector import Sector, same_band, same_grid
 from .subaperture import Spectrum, SubApertures
 from .target import Target, choose_target, find_target, spectrum_sign_evidence
 from .threads import in_order
@@ -84,6 +84,15 @@ def _cut(spectrum: NDArray[np.complex64], first: int, count: int, axis: int) -> 
         parts = [slice(first % size, first % size + count)]
     found = [spectrum[part] if axis == 0 else spectrum[:, part] for part in parts]
     return np.concatenate(found, axis) if len(found) > 1 else found[0]
+
+
+def uncovered(arcs: Arcs, track: Track) -> list[Arc]:
+    """Return the arcs that a track goes through, but no sector covers."""
+    return [
+        arc
+        for arc in arcs.missing()
+        if track.covered_fraction(arc.start_rad + arc.width_rad / 2.0, arc.width_rad) > 0.0
+    ]
 
 
 class SectorSum:
@@ -194,12 +203,15 @@ class SectorSum:
         first = self._first
         if first is None:
             return
-        if not same_grid(first.grid, sector.grid) or sector.acoustics != first.acoustics:
-            what = "band" if same_grid(first.grid, sector.grid) else "grid"
-            raise GeometryError(
-                f"sector at {sector.stamp_ns} ns has another {what} than the first at {first.stamp_ns} ns:"
-                f" {getattr(sector, 'grid' if what == 'grid' else 'acoustics')}; expected one for all"
-            )
+        for what, same, own, expected in (
+            ("grid", same_grid(first.grid, sector.grid), sector.grid, first.grid),
+            ("band", same_band(first.acoustics, sector.acoustics), sector.acoustics, first.acoustics),
+        ):
+            if not same:
+                raise GeometryError(
+                    f"sector at {sector.stamp_ns} ns has another {what} than the first, at"
+                    f" {first.stamp_ns} ns: {own}; expected {expected}"
+                )
 
     def _add(self, sector: Sector, arc: Arc, energy: float) -> float:
         """Add a sector's arc of the spectrum; return how far it reaches beyond the sector's."""
@@ -348,13 +360,7 @@ class Stream:
 
     def missing(self) -> list[Arc]:
         """Return the arcs that the track covers, but no sector."""
-        if self.track is None:
-            return []
-        return [
-            arc
-            for arc in self.sum.arcs.missing()
-            if self.track.covered_fraction(arc.start_rad + arc.width_rad / 2.0, arc.width_rad) > 0.0
-        ]
+        return [] if self.track is None else uncovered(self.sum.arcs, self.track)
 
     def update(self) -> list[int]:
         """Decide on the target as far as it can be, and return the stamps of the views that became due.

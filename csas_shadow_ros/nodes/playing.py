@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from csas_shadow_ros.bags import BagReader
+from csas_shadow_ros.bags.run import odd_sectors, sector_infos
 from csas_shadow_ros.core.errors import BagError, ParameterError
 from msg_adapters import TOPICS, VIEW_STREAMS
 from msg_adapters.messages import NANOSECONDS
@@ -110,8 +111,15 @@ class BagViews:
             if stamp is not None and stamp not in self._infos:
                 self._infos[stamp] = bytes(message.cdr)
                 self.times[stamp] = message.log_time_ns
+        if stream == "sector":
+            # The graph takes the first for right; of a bag it is known what most are like.
+            for stamp, reason in odd_sectors(sector_infos(reader)).items():
+                self.problems.append(f"{self._kind.image_topic} ({stamp} ns): {reason}")
+                del self._infos[stamp], self.times[stamp]
         self._cursor: Iterator[Any] | None = None
         self._recent: OrderedDict[int, bytes] = OrderedDict()
+        #: Stamps of the images that the cursor has passed.
+        self._passed: set[int] = set()
 
     def _stamp(self, message: Any) -> int | None:
         try:
@@ -136,10 +144,12 @@ class BagViews:
         for again in (False, True):
             if self._cursor is None or again:
                 self._cursor = self._reader.messages([self._kind.image_topic])
+                self._passed.clear()
             for message in self._cursor:
                 found = self._stamp(message)
-                if found is None:
-                    continue
+                if found is None or found in self._passed:
+                    continue  # of a stamp that comes again the first image counts, as everywhere
+                self._passed.add(found)
                 self._recent[found] = bytes(message.cdr)
                 while len(self._recent) > _CACHED:
                     self._recent.popitem(last=False)

@@ -11,7 +11,7 @@ from pathlib import Path
 from .export import export_html
 from .server import ViewerServer
 from .source import PathSource
-from .store import ViewStore
+from .store import ViewerError, ViewStore
 
 
 def view(
@@ -46,9 +46,27 @@ def view(
 
 
 def save_html(path: str | Path, out: str | Path, step: int) -> int:
-    """Write the page of a results folder or a bag as one HTML file; return its size in bytes."""
+    """Write the page of a results folder or a bag as one HTML file; return its size in bytes.
+
+    Raises
+    ------
+    ViewerError, BagError
+        If there is nothing to see, what there is cannot be read, or the file cannot be written.
+    """
     store = ViewStore()
     source = PathSource(store, path)
+    file = Path(out)
+    new = not file.exists()
+    try:
+        # Before the work, which may take a while.
+        with file.open("ab"):
+            pass
+    except OSError as error:
+        raise ViewerError(f"cannot write {out}: {error.strerror}") from error
     source.start()
     source.done.wait()
-    return Path(out).write_bytes(export_html(store, step))
+    if source.failed:
+        if new:
+            file.unlink()
+        raise ViewerError(source.failed)
+    return file.write_bytes(export_html(store, step))

@@ -15,6 +15,7 @@ from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from aiohttp import WSMsgType, web
 
@@ -25,7 +26,9 @@ from ..core.threshold import thresholded
 from .store import ViewerError, ViewStore
 
 STATIC = Path(__file__).parent / "static"
-_COOKIE = "csas_viewer_token"
+_EVERY_ADDRESS = ("0.0.0.0", "::")
+#: With the port: cookies know none, and two viewers on one machine would log each other out.
+_COOKIE = "csas_viewer_token_{}"
 #: Notices that wait for a slow page; beyond that it is cut off, comes back and gets everything anew.
 _QUEUE = 4096
 _MESHES = {"stl": "model/stl", "ply": "model/ply", "obj": "model/obj", "glb": "model/gltf-binary"}
@@ -81,8 +84,10 @@ class ViewerServer:
     @property
     def url(self) -> str:
         """Where the page is, with its token."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+        # Nobody else can open "every address of this machine": its name stands for them.
+        host = socket.gethostname() if self.host in _EVERY_ADDRESS else self.host
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{self.port}/" + (f"?token={quote(self.token)}" if self.token else "")
 
     def start(self) -> None:
         """Listen.
@@ -169,7 +174,7 @@ class ViewerServer:
         origin = request.headers.get("Origin")
         if origin is not None and origin.partition("://")[2] != request.host:
             raise web.HTTPForbidden(text="the viewer answers its own page alone")
-        given = request.query.get("token") or request.cookies.get(_COOKIE) or ""
+        given = request.query.get("token") or request.cookies.get(_COOKIE.format(self.port)) or ""
         if self.token is not None and not hmac.compare_digest(given.encode(), self.token.encode()):
             raise web.HTTPUnauthorized(text="the viewer asks for its token: open the address that it printed")
         try:
@@ -181,7 +186,7 @@ class ViewerServer:
         if not response.prepared:
             response.headers.update(_HEADERS)
             if self.token is not None and "token" in request.query:
-                response.set_cookie(_COOKIE, self.token, httponly=True, samesite="Strict")
+                response.set_cookie(_COOKIE.format(self.port), self.token, httponly=True, samesite="Strict")
         return response
 
     # What is answered

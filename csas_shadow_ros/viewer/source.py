@@ -62,6 +62,9 @@ class Reduced:
     def __init__(self, image: CoherentImage, track: Track, p: SubApertureParameters) -> None:
         self._image, self._track = image, track
         self._p = replace(p, aperture_deg=min(REDUCED_DEG, p.aperture_deg), spacing_m=0.0)
+        # Browsers keep what an address gave: another run, with the same stamps, is to have others.
+        sample = np.ascontiguousarray(image.pixels[::16, ::16])
+        self._revision = f"{zlib.crc32(sample.tobytes()):08x}_{self._p.aperture_deg:g}"
 
     def fill(self, store: ViewStore) -> None:
         """Add one to the store for each sub-aperture view, or shadow view, that is there."""
@@ -78,7 +81,7 @@ class Reduced:
                 return codes.amplitude_codes(made.view_of_aspect(aspect).pixels)
 
             # The stamp of the view that it is compared with, to the nanosecond.
-            entry = Entry(replace(info, stamp_ns=one.info.stamp_ns), f"{self._p.aperture_deg:g}", load)
+            entry = Entry(replace(info, stamp_ns=one.info.stamp_ns), self._revision, load)
             store.put_view("reduced", entry)
 
 
@@ -160,7 +163,12 @@ def grid_of(
 
 def grid_of_folder(folder: Path, method: str) -> VoxelGrid:
     """Read ``grid.npz``."""
-    with np.load(folder / "grid.npz") as data:
+    path = folder / "grid.npz"
+    try:
+        data = np.load(path)
+    except (OSError, ValueError, EOFError) as error:
+        raise ViewerError(f"{path} cannot be read: {error}; make it again: csas-shadow run") from error
+    with data:
         origin = tuple(float(v) for v in data["origin_m"])
         likelihood = data["likelihood"]
         volume = Volume((origin[0], origin[1], origin[2]), float(data["voxel_size_m"]), likelihood.shape)
@@ -211,13 +219,29 @@ class PathSource:
         self._spool = Spool()
         self._thread: threading.Thread | None = None
         self.done = threading.Event()
+        #: What was damaged or unusable, a line each.
+        self.problems: list[str] = []
+        #: Why not all could be read; empty if it could.
+        self.failed = ""
         held = [s for s in VIEW_STREAMS if (t := self._reader.topic(STREAMS[s].image_topic)) and t.count]
+        if not held and (verdict := self._report.get("verdict")):
+            raise ViewerError(f"{self._folder} holds no views to look at: its run says {verdict!r}")
         if not held:
             raise ViewerError(
                 f"{path} holds no views ({', '.join(VIEW_STREAMS)});"
                 f" make them: csas-shadow run {path} --out DIR"
             )
         self._held = held
+
+    def _problem(self, problem: object) -> None:
+        """Name what is wrong, once, in the log and on the page: nothing is missing without a word."""
+        line = str(problem)
+        if line in self.problems:
+            return
+        self.problems.append(line)
+        log.warning("%s", line)
+        more = f" (and {len(self.problems) - 1} more)" if len(self.problems) > 1 else ""
+        self.store.put_part("damage", f"{self.problems[0]}{more}")
 
     def _use_report(self) -> None:
         p = self._report.get("parameters", {})
@@ -234,7 +258,7 @@ class PathSource:
         try:
             index: BagIndex | None = BagIndex(self._reader)
         except BagError as error:
-            log.info("%s", error)
+            log.info("%s", error)  # read from end to end instead: damage is named on the way
             index = None
         if index is not None:
             for name in first:
@@ -245,11 +269,11 @@ class PathSource:
 
     def _register(self, index: BagIndex, name: str) -> None:
         infos = {}
-        for _, message, stamp in checked_messages(self._reader, STREAMS[name].info_topic, lambda _: None):
+        for _, message, stamp in checked_messages(self._reader, STREAMS[name].info_topic, self._problem):
             try:
                 infos[stamp] = view_info_from_msg(message, name)
             except CsasError as error:
-                log.warning("%s: %s", STREAMS[name].info_topic, error)
+                self._problem(f"{STREAMS[name].info_topic}: {error}")
         stat = os.stat(self._bag)
         revision = f"{(stat.st_mtime_ns ^ stat.st_size) & 0xFFFFFFFF:08x}"
         for stamp, read in sorted(index.places(name, set(infos)).items()):
@@ -266,9 +290,9 @@ class PathSource:
             truth = self._report.get("truth")
             store.put_part("truth", truth.get("dimensions") if isinstance(truth, dict) else None)
             store.put_part("status", self._report.get("verdict", ""))
-        for _, message, _ in checked_messages(self._reader, "track", lambda _: None):
+        for _, message, _ in checked_messages(self._reader, "track", self._problem):
             store.put_track(track_from_msg(message))
-        for _, message, _ in checked_messages(self._reader, "target", lambda _: None):
+        for _, message, _ in checked_messages(self._reader, "target", self._problem):
             store.put_part("target", box_json(target_from_msg(message)))
         store.put_part("reduced", bool(self._reader.topic("image") or self._reader.topic("sector/image")))
         store.make_reduced = self._make_reduced
@@ -294,18 +318,21 @@ class PathSource:
                     for entry in list(self.store.sets[name].values()):
                         shape.add(name, entry)
             shape.publish(measure=measure)
-        except CsasError as error:
-            log.warning("%s", error)
-            self.store.put_part("status", str(error))
+        except (CsasError, OSError, ValueError, KeyError) as error:  # numpy's, of a grid.npz that is none
+            self.failed = str(error) if isinstance(error, CsasError) else f"{type(error).__name__}: {error}"
+            self._problem(self.failed)
+            self.store.put_part("status", self.failed)
         finally:
+            for line in self._reader.problems:
+                self._problem(line)
             self.done.set()
 
     def _sequential(self, name: str) -> Any:
-        for pair in iterate_pairs(self._reader, name, lambda problem: log.warning("%s", problem)):
+        for pair in iterate_pairs(self._reader, name, self._problem):
             try:
                 yield view_from_msgs(pair.image, pair.info, name)
             except CsasError as error:
-                log.warning("%s", error)
+                self._problem(error)
 
     def _grid(self) -> None:
         p = self._parameters.carving
@@ -315,7 +342,7 @@ class PathSource:
             return
         found: dict[str, tuple[Volume, NDArray[np.float32]]] = {}
         for name in ("voxel_grid", "voxel_views"):
-            for pair in iterate_pairs(self._reader, name, lambda _: None):
+            for pair in iterate_pairs(self._reader, name, self._problem):
                 _, volume, values = voxel_grid_from_msgs(pair.image, pair.info, name)
                 found[name] = volume, values
         if "voxel_grid" in found:
@@ -325,7 +352,7 @@ class PathSource:
 
     def _composites(self) -> None:
         for name in ("multilook", "color_by_aspect"):
-            for pair in iterate_pairs(self._reader, name, lambda _: None):
+            for pair in iterate_pairs(self._reader, name, self._problem):
                 info, pixels = ground_picture_from_msgs(pair.image, pair.info, name)
                 shown = codes.amplitude_codes(pixels) if name == "multilook" else np.asarray(pixels)
                 self.store.put_picture(name, info, shown)

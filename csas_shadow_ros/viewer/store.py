@@ -142,6 +142,7 @@ class ViewStore:
             "pictures": {},
             "volumes": {},
             "status": "",
+            "damage": "",
             "reduced": False,
         }
         self._volume_bytes: dict[str, bytes] = {}

@@ -19,6 +19,7 @@ from synthetic import COUNT, code_of, entry
 from csas_shadow_ros.cli import main
 from csas_shadow_ros.core.mesh import mesh_from_grid
 from csas_shadow_ros.viewer.export import export_html
+from csas_shadow_ros.viewer.server import ViewerServer
 from csas_shadow_ros.viewer.store import ViewStore
 
 #: Where screenshots go: the README's are made by this run (CSAS_SCREENSHOTS=docs/figures).
@@ -386,6 +387,90 @@ def test_every_key_of_the_help_does_what_it_says(watched, serve, run_store):
     watched.until(f"csas.stats.surfaces.length > {surfaces}")
 
 
+def test_after_a_click_on_a_box_or_a_button_the_keys_still_work(watched, serve):
+    watched.open(serve(store_of()))
+    page = watched.page
+    page.click("#contour")
+    page.click("#contour")
+    page.keyboard.press("ArrowRight")
+    assert shown(watched) == [4, 4]
+    page.click("#fit")
+    page.keyboard.press("Space")
+    watched.until("csas.playing && csas.state.aspect > 20")
+    page.keyboard.press("Space")
+    assert watched.js("!csas.playing && csas.state.contour")
+
+
+def test_arrows_move_what_is_on_the_screen_whatever_is_up(watched, serve, run_store):
+    watched.open(serve(run_store))
+    watched.js("csas.state.orientation = 'sonar', csas.setAspect(250)")
+    watched.drawn()
+    for key, axis, sign in (("Right", 0, 1), ("Left", 0, -1), ("Up", 1, -1), ("Down", 1, 1)):
+        a, b, c, d, *_ = watched.js("csas.panels[1].ground(csas.current)")
+        x0, y0 = watched.js("csas.state.centre")
+        watched.page.keyboard.press(f"Alt+Arrow{key}")
+        watched.drawn()
+        x, y = (v - w for v, w in zip(watched.js("csas.state.centre"), (x0, y0), strict=True))
+        moved = (a * x + c * y, b * x + d * y)  # canvas pixels, y downwards
+        assert sign * moved[axis] > 5, key
+        assert abs(moved[1 - axis]) < 1e-6 * abs(moved[axis]), key
+
+
+def test_another_run_at_the_same_address_leaves_nothing_of_the_first(watched, serve, run_store):
+    first = ViewerServer(run_store)
+    first.start()
+    watched.open(first.url)
+    watched.until("csas.solid.sides.main.triangles > 0 && csas.surfaceMeasures")
+    first.stop()
+    watched.until("document.querySelector('#link').textContent.includes('away')")
+    other = store_of()
+    other.title = "another run"
+    serve(other, port=first.port)
+    watched.until("document.querySelector('#title').textContent === 'another run'")
+    watched.until("csas.views('shadow').length === 90")
+    assert watched.js("[csas.solid.sides.main.mesh.visible, csas.solid.sides.other.mesh.visible]") == [False, False]
+    assert "surface here" not in watched.page.locator("#dimensions").inner_text()
+    for row in ("#row-main", "#row-other"):
+        assert not watched.page.locator(row).is_visible()
+    watched.said[:] = [s for s in watched.said if "WebSocket" not in s and "ERR_CONNECTION_REFUSED" not in s]
+
+
+def test_a_run_of_likelihoods_alone_shows_them(watched, serve):
+    store = ViewStore(title="likelihoods")
+    for i in range(COUNT):
+        store.put_view("likelihood", entry(i))
+    watched.open(serve(store))
+    assert watched.js("csas.panels.map(p => p.layer)") == ["likelihood", "likelihood"]
+    watched.settle()
+
+
+def test_a_link_that_was_edited_gives_defaults_for_what_it_breaks(watched, serve):
+    url = serve(store_of())
+    watched.open(f'{url}#{{"layers":null,"aspect":"a","zoom":2,"centre":[1],"range":1e999,"strange":1}}')
+    assert watched.js("[csas.state.zoom, csas.state.aspect, ...csas.state.centre]") == [2, 0, 0, 0]
+    assert shown_layers(watched) == ["sub_aperture", "shadow"]
+
+
+def shown_layers(watched: Any) -> list[str]:
+    return watched.js("csas.panels.map(p => p.layer)")
+
+
+def test_a_range_beyond_the_lowest_level_is_not_claimed(watched, serve):
+    watched.open(serve(store_of()))
+    watched.js("csas.state.range = 60, csas.state.top = 0, csas.sayLevels()")
+    assert watched.page.locator("#range-db + output").inner_text() == "32 dB"
+
+
+def test_what_is_damaged_is_said_on_the_page(watched, serve):
+    store = store_of()
+    url = serve(store)
+    watched.open(url)
+    assert not watched.page.locator("#damage").is_visible()
+    store.put_part("damage", "result.mcap: damaged at byte 17")
+    watched.until("!document.querySelector('#damage').hidden")
+    assert "byte 17" in watched.page.locator("#damage").inner_text()
+
+
 def test_two_fingers_come_closer(watched, serve):
     watched.open(serve(store_of()))
     touch = watched.page.context.new_cdp_session(watched.page)
@@ -411,6 +496,7 @@ def test_the_command_line_writes_a_page_that_opens_without_a_server(watched, res
     watched.open(path.as_uri())
     assert watched.js("csas.views('shadow').length") == math.ceil(len(run_store.sets["shadow"]) / 6)
     watched.until("csas.panels.every(p => p.found?.bitmap && !p.found.late)")
+    assert not watched.page.locator("#save-mesh").is_visible()  # the server would make it
 
 
 def test_one_html_file_opens_without_a_server(watched, run_store, tmp_path):
@@ -447,8 +533,6 @@ def test_keys_open_the_help_and_a_tablet_has_room_for_everything(watched, serve,
 
 
 def test_a_server_that_goes_and_comes_back_is_found_again_without_a_reload(watched, serve):
-    from csas_shadow_ros.viewer.server import ViewerServer
-
     store = store_of(range(10))
     server = ViewerServer(store)
     server.start()

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import gc
 import json
+import shutil
 import socket
 import urllib.error
 import urllib.request
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import urlparse
 
 import numpy as np
 import pytest
 from synthetic import entry
 
+from csas_shadow_ros.bags import read_run
+from csas_shadow_ros.cli import main
 from csas_shadow_ros.core.mesh import mesh_from_grid
+from csas_shadow_ros.core.parameters import SubApertureParameters
 from csas_shadow_ros.core.volume import Volume, VoxelGrid
 from csas_shadow_ros.viewer import codes
 from csas_shadow_ros.viewer.server import ViewerServer, is_loopback
-from csas_shadow_ros.viewer.source import PathSource
+from csas_shadow_ros.viewer.source import PathSource, Reduced
 from csas_shadow_ros.viewer.store import Spool, ViewerError, ViewStore
 
 
@@ -28,6 +35,70 @@ def get(url: str, **headers: str) -> tuple[int, bytes]:
     except urllib.error.HTTPError as error:
         with error:
             return error.code, error.read()
+
+
+def cut(results: Path, tmp_path: Path) -> Path:
+    """A copy of a results folder whose bag was cut off in the middle."""
+    out = tmp_path / "cut"
+    shutil.copytree(results, out)
+    bag = out / "result.mcap"
+    with bag.open("r+b") as file:
+        file.truncate(bag.stat().st_size // 2)
+    return out
+
+
+def test_a_bag_that_was_cut_off_is_shown_and_said_to_be(results, tmp_path) -> None:
+    store = ViewStore()
+    source = PathSource(store, cut(results, tmp_path))
+    source.start()
+    assert source.done.wait(60)
+    assert 0 < len(store.sets["shadow"]) < 72
+    assert "result.mcap" in store.scene()["damage"]
+
+
+def test_a_grid_that_is_none_is_named_and_no_page_is_saved_without_it(results, tmp_path, capsys) -> None:
+    folder, page = tmp_path / "bad", tmp_path / "page.html"
+    shutil.copytree(results, folder)
+    (folder / "grid.npz").write_bytes(b"no grid at all")
+    assert main(["view", str(folder), "--html", str(page)]) == 1
+    assert "grid.npz cannot be read" in capsys.readouterr().err
+    assert not page.exists()
+
+
+@pytest.mark.parametrize("where", ["nowhere/page.html", "."])
+def test_a_page_that_cannot_be_written_is_refused_in_one_line(results, tmp_path, capsys, where: str) -> None:
+    assert main(["view", str(results), "--html", str(tmp_path / where)]) == 1
+    error = capsys.readouterr().err
+    assert "cannot write" in error
+    assert "Traceback" not in error
+
+
+def test_a_run_without_an_object_says_so_instead_of_asking_for_another_run(tmp_path, capsys) -> None:
+    assert main(["simulate", str(tmp_path / "empty"), "--profile", "tiny", "--target", "empty", "-q"]) == 0
+    given = ["--out", str(tmp_path / "out"), "--step-deg", "10", "--no-figures", "-q"]
+    assert main(["run", str(tmp_path / "empty"), *given]) == 0
+    capsys.readouterr()
+    assert main(["view", str(tmp_path / "out")]) == 1
+    error = capsys.readouterr().err
+    assert "no object" in error
+    assert "make them" not in error
+
+
+def test_reduced_views_of_another_run_have_other_addresses(tiny_box_bag) -> None:
+    run = read_run(tiny_box_bag.path)
+    image, revisions = run.coherent_image(), set()
+    for pixels in (image.pixels, image.pixels * np.complex64(2)):
+        store = ViewStore()
+        store.put_view("shadow", entry(0))
+        Reduced(replace(image, pixels=pixels), run.require_track(), SubApertureParameters()).fill(store)
+        revisions |= {each.revision for each in store.sets["reduced"].values()}
+    assert len(revisions) == 2
+
+
+def test_a_token_is_told_so_that_its_address_opens(serve) -> None:
+    url = serve(ViewStore(), host="0.0.0.0", token="a b&c#é")
+    assert "0.0.0.0" not in url
+    assert get(url.replace(socket.gethostname(), "127.0.0.1"))[0] == 200
 
 
 def test_codes_are_levels_over_the_median_to_half_a_step() -> None:
@@ -116,7 +187,7 @@ def test_on_the_network_nothing_is_answered_without_the_token(serve) -> None:
         assert get(bare + path)[0] == 401
         assert get(f"{bare}{path}?token=wrong")[0] == 401
     assert get(f"{bare}?token={token}")[0] == 200
-    assert get(f"{bare}api/scene", Cookie=f"csas_viewer_token={token}")[0] == 200
+    assert get(f"{bare}api/scene", Cookie=f"csas_viewer_token_{urlparse(url).port}={token}")[0] == 200
 
 
 def test_a_page_of_somebody_else_is_not_answered(serve) -> None:

@@ -10,7 +10,9 @@ class App {
   constructor() {
     const held = $("content");
     const content = held && JSON.parse(held.textContent);
-    this.state = { ...structuredClone(DEFAULTS), ...this.fromLink(), ruling: false, ruler: null };
+    const linked = this.fromLink();
+    this.linkedLayers = !!linked.layers;
+    this.state = { ...structuredClone(DEFAULTS), ...linked, ruling: false, ruler: null };
     this.scene = { sets: {}, pictures: {}, volumes: {}, track: [], target: null, dimensions: null, codes: { low_db: -32, step_db: 0.25 } };
     this.sorted = {};
     this.volumes = {};
@@ -25,7 +27,7 @@ class App {
     this.controls();
     if (content) {
       $("link").textContent = "saved file";
-      $("save-html").hidden = true;
+      $("save-html").hidden = $("save-mesh-row").hidden = true; // the server makes these
       this.all(content.scene);
     } else this.connect();
   }
@@ -75,13 +77,15 @@ class App {
 
   all(scene) {
     if (this.scene.live && scene.live && scene.instance !== this.scene.instance) this.keep(scene);
+    const target = JSON.stringify(this.scene.target);
     this.scene = scene;
+    if (JSON.stringify(scene.target) !== target) this.looked = false;
+    this.settleLayers();
     this.sorted = {};
     document.title = `${scene.title || "CSAS"} — shadows`;
     $("title").textContent = scene.title || "CSAS shadows";
     if ($("link").classList.contains("on")) this.linked(true);
-    for (const name of ["track", "target", "volumes", "dimensions", "pictures"]) this.part(name);
-    if (this.state.layers.includes("reduced")) this.wantReduced();
+    for (const name of ["track", "target", "volumes", "dimensions", "pictures", "damage", "reduced"]) this.part(name);
     this.refetch();
     this.dirty();
   }
@@ -101,9 +105,22 @@ class App {
     if (name === "track" || name === "target") {
       this.solid?.surroundings();
       if (this.solid && name === "target" && this.scene.target && !this.looked) { this.looked = true; this.solid.whole(false); }
-    } else if (name === "volumes" && this.solid) for (const each of Object.keys(this.scene.volumes)) this.fetchVolume(each);
-    else if (name === "dimensions" || name === "truth") this.dimensions();
+    } else if (name === "volumes" && this.solid) {
+      for (const each of ["main", "other"]) if (this.scene.volumes[each]) this.fetchVolume(each); else this.dropVolume(each);
+    } else if (name === "damage") {
+      $("damage").hidden = !this.scene.damage;
+      $("damage").textContent = $("damage").title = this.scene.damage ?? "";
+    } else if (name === "reduced") {
+      if (this.scene.reduced && this.panels.some((p) => p.layer === "reduced")) this.wantReduced();
+    } else if (name === "dimensions" || name === "truth") this.dimensions();
     if (name === "track" || name === "pictures") this.refetch();
+  }
+
+  // Pictures that nobody chose by hand show what there is.
+  settleLayers() {
+    const there = LAYERS.map(([name]) => name).filter((name) => this.scene.sets[name]?.views.length);
+    if (!there.length) return;
+    this.panels.forEach((p, i) => { if (!p.chosen && !there.includes(p.layer)) p.layer = p.select.value = there[Math.min(i, there.length - 1)]; });
   }
 
   views(name) {
@@ -221,7 +238,13 @@ class App {
   }
 
   fromLink() {
-    try { return JSON.parse(decodeURIComponent(location.hash.slice(1))); } catch { return {}; }
+    let told = {};
+    try { told = JSON.parse(decodeURIComponent(location.hash.slice(1))); } catch { /* no link of ours */ }
+    // Whoever shortens or edits a link gets the default for what is not understood.
+    const like = (a, b) => typeof a === typeof b && (typeof a !== "number" || Number.isFinite(a)) && (!Array.isArray(b) || (Array.isArray(a) && a.length === b.length && a.every((v, i) => like(v, b[i]))));
+    const kept = Object.fromEntries(Object.entries(told ?? {}).filter(([key, value]) => value !== null && key in DEFAULTS && like(value, DEFAULTS[key])));
+    if (kept.layers) kept.layers = kept.layers.map((name, i) => (LAYERS.some(([each]) => each === name) ? name : DEFAULTS.layers[i]));
+    return kept;
   }
 
   // Drawing
@@ -271,7 +294,8 @@ class App {
   startSurfaces(worker) {
     this.worker = worker;
     this.worker.onmessage = ({ data }) => {
-      if (data.did === "surface") {
+      if (data.did === "surface" && !this.volumes[data.name]) this.busySurface = false; // of a run that is gone
+      else if (data.did === "surface") {
         this.stats.surfaces.push(performance.now() - data.asked);
         this.busySurface = false;
         this.solid.set(data.name, data);
@@ -295,6 +319,7 @@ class App {
       const codes = new Uint8Array(bytes);
       this.volumes[name] = { ...about, codes };
       this.worker.postMessage({ do: "volume", name, volume: { shape: about.shape, origin: about.origin, voxel: about.voxel }, bytes: codes.buffer.slice(0) });
+      $(`row-${name}`).hidden = false;
       const row = $(`row-${name}`), label = { soft: "Soft carving", hard: "Hard carving", consensus: "Silhouettes" }[about.method] ?? about.method;
       row.querySelector("span").textContent = label;
       $(`tag-${name}`).textContent = label;
@@ -302,9 +327,26 @@ class App {
       input.max = about.method === "soft" ? 254 : 160;
       const auto = about.threshold === null ? 1 : Math.max(1, 254 * Math.sqrt(about.threshold));
       this.auto = { ...this.auto, [name]: auto };
-      input.value = this.state.thresholds[name] ?? auto;
-      this.threshold(name, this.state.thresholds[name] ?? auto);
+      const chosen = this.state.thresholds[about.method] ?? auto; // a threshold of another method means nothing
+      input.value = chosen;
+      this.threshold(name, chosen);
     } catch { /* a newer volume has come, or the server is away: it is told again */ }
+  }
+
+  dropVolume(name) {
+    $(`row-${name}`).hidden = true;
+    if (!this.volumes[name]) return;
+    delete this.volumes[name];
+    this.worker.postMessage({ do: "drop", name });
+    this.solid.set(name, { points: new Float32Array(0), faces: new Uint32Array(0) });
+    this.solid.evidence(name, { codes: new Uint8Array(0), shape: [0, 0, 0], origin: [0, 0, 0], voxel: 1 }, 1);
+    delete $(`row-${name}`).dataset.triangles;
+    $(`tag-${name}`).textContent = "";
+    if (name !== "main") return;
+    clearTimeout(this.exact);
+    this.casts.clear();
+    this.surfaceMeasures = this.thresholdQuery = undefined;
+    this.dimensions();
   }
 
   threshold(name, code) {
@@ -333,6 +375,7 @@ class App {
     const at = auto && Math.abs(value - auto) < 2e-4 ? "" : `?threshold=${value}`;
     this.thresholdQuery = at;
     try { this.surfaceMeasures = await (await fetch(`api/surface/main.json${at}`)).json(); } catch { this.surfaceMeasures = undefined; }
+    if (!this.volumes.main) this.surfaceMeasures = undefined;
     this.dimensions();
   }
 
@@ -387,28 +430,51 @@ class App {
     press("save-picture", () => this.savePicture());
     press("copy-link", () => this.copyLink());
     press("save-html", () => this.download("api/export.html?step=2"));
-    $("save-mesh").onchange = () => { const kind = $("save-mesh").value; if (kind) this.download(`api/mesh/main.${kind}${this.thresholdQuery ?? ""}`); $("save-mesh").value = ""; };
+    $("save-mesh").onchange = () => { const kind = $("save-mesh").value; if (kind && this.surfaceMeasures && !this.surfaceMeasures.object) $("measured").textContent = "No object at this threshold: no mesh to save."; else if (kind) this.download(`api/mesh/main.${kind}${this.thresholdQuery ?? ""}`); $("save-mesh").value = ""; };
     for (const [id, key] of [["top-db", "top"], ["range-db", "range"]]) {
-      const input = $(id), say = () => (input.nextElementSibling.textContent = `${s[key]} dB`);
-      input.value = s[key]; say();
-      input.oninput = () => { s[key] = +input.value; say(); this.save(); this.dirty(); };
+      const input = $(id);
+      input.oninput = () => { s[key] = +input.value; this.sayLevels(); this.save(); this.dirty(); };
     }
-    for (const name of ["main", "other"]) $(`threshold-${name}`).oninput = (e) => { s.thresholds[name] = +e.target.value; this.threshold(name, +e.target.value); this.save(); };
+    this.sayLevels();
+    for (const name of ["main", "other"]) $(`threshold-${name}`).oninput = (e) => { s.thresholds[this.volumes[name]?.method ?? name] = +e.target.value; this.threshold(name, +e.target.value); this.save(); };
     $("orientation").textContent = s.orientation === "north" ? "North up" : "Sonar up";
     addEventListener("keydown", (e) => this.key(e));
+    // What was clicked would take the keys: a space would press it again instead of playing.
+    addEventListener("click", (e) => {
+      if (!e.detail) return; // by a key
+      const pressed = e.target.closest?.("button, input[type=checkbox], label");
+      (pressed?.querySelector("input[type=checkbox]") ?? pressed)?.blur();
+    });
     addEventListener("hashchange", () => location.reload());
+  }
+
+  // No code is darker than the lowest: a range beyond it would be a lie.
+  sayLevels() {
+    const s = this.state, low = this.scene.codes.low_db;
+    s.range = Math.min(s.range, s.top - low);
+    for (const [id, key] of [["top-db", "top"], ["range-db", "range"]]) {
+      $(id).value = s[key];
+      $(id).nextElementSibling.textContent = `${s[key]} dB`;
+    }
+  }
+
+  // A step on the screen (right, up; of the picture's radius at no zoom), in scene metres.
+  onScreen([right, up], share) {
+    const [a, b, c, d] = this.panels[1].ground(this.current), det = a * d - b * c, x = (d * right + c * up) / det, y = (-a * up - b * right) / det;
+    const m = (share * this.sceneRadius) / this.state.zoom / Math.hypot(x, y);
+    return [x * m, y * m];
   }
 
   key(e) {
     if ($("help").open || e.ctrlKey || e.metaKey) return;
-    const typing = /^(INPUT|SELECT)$/.test(e.target.tagName);
+    const typing = e.target.matches?.("input:not([type=checkbox]), select");
     const pan = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[e.key];
     const done = () => e.preventDefault();
     const digit = /^Digit([1-6])$/.exec(e.code);
     const at = (id, by) => { const i = $(id); i.value = +i.value + by; i.oninput({ target: i }); };
-    if (pan && e.altKey) { const m = (0.1 * this.sceneRadius) / this.state.zoom; this.moveBy(pan[0] * m, pan[1] * m); this.save(); return done(); }
+    if (pan && e.altKey) { this.moveBy(...this.onScreen(pan, 0.1)); this.save(); return done(); }
     if (typing && (pan || e.key === " " || e.key === "Home" || e.key === "End" || e.key.startsWith("Page"))) return;
-    if (pan && this.state.ruling && this.state.ruler) { const m = (0.005 * this.sceneRadius) / this.state.zoom; this.state.ruler[1] = [this.state.ruler[1][0] + pan[0] * m, this.state.ruler[1][1] + pan[1] * m]; this.dirty(); return done(); }
+    if (pan && this.state.ruling && this.state.ruler) { const [x, y] = this.onScreen(pan, 0.005); this.state.ruler[1] = [this.state.ruler[1][0] + x, this.state.ruler[1][1] + y]; this.dirty(); return done(); }
     const press = { n: "orientation", r: "ruler", 0: "fit", s: "save-picture", l: "copy-link", c: "contour", m: "cast", b: "compare", v: "evidence", k: "whole", "?": "help-open" }[e.key.toLowerCase()];
     if (digit && e.code !== "Digit0") { this.panels[e.shiftKey ? 0 : 1].choose(LAYERS[digit[1] - 1][0]); this.save(); return done(); }
     if (press) { $(press).click(); return done(); }
@@ -465,7 +531,7 @@ class App {
     g.fillStyle = "#0b0f12"; g.fillRect(0, 0, out.width, out.height);
     g.drawImage(canvas, 0, 0); g.drawImage(p.slider.ring, 0, 0);
     g.fillStyle = "#c9d3d9"; g.font = "13px sans-serif";
-    g.fillText(`${p.select.selectedOptions[0].text} · ${$("where").textContent}`, 8, out.height - 8);
+    g.fillText(`${p.select.selectedOptions[0].text} · ${$("where").textContent}`, 8, out.height - 8, out.width - 16);
     out.convertToBlob({ type: "image/png" }).then((blob) => {
       const url = URL.createObjectURL(blob);
       this.download(url, `${p.layer}_${Math.round(this.current?.aspect_deg ?? 0)}.png`);

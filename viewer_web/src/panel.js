@@ -32,6 +32,7 @@ export class Panel {
   constructor(place, app, layer, label) {
     this.app = app;
     this.layer = layer;
+    this.chosen = app.linkedLayers; // by hand, or by a link: not by what there is
     place.innerHTML = `<div class="row"><label>${label} <select aria-label="Layer, ${label}"></select></label><span class="about"></span></div><div class="dial"><csas-slider label="Aspect, ${label} picture"></csas-slider><div class="note"></div></div>`;
     this.select = place.querySelector("select");
     this.slider = place.querySelector("csas-slider");
@@ -46,6 +47,7 @@ export class Panel {
   }
 
   choose(layer) {
+    this.chosen = true;
     this.layer = this.select.value = layer;
     if (layer === "reduced") this.app.wantReduced();
     this.app.refetch();

@@ -140,8 +140,12 @@ async function decode({ id, blob }) {
 self.onmessage = ({ data }) => {
   if (data.do === "decode") return void decode(data);
   if (data.do === "volume") volumes[data.name] = { ...data.volume, codes: new Uint8Array(data.bytes) };
+  if (data.do === "drop") delete volumes[data.name];
   const volume = volumes[data.name];
-  if (!volume) return;
+  if (!volume) {
+    if (data.do === "surface") self.postMessage({ did: "surface", name: data.name }); // dropped meanwhile
+    return;
+  }
   if (data.do === "surface") {
     const began = performance.now();
     volume.mesh = surface(volume, data.threshold);
