@@ -1,0 +1,148 @@
+"""Bags of sectors: what is wrong with some of them is told, and does not spoil the others."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from csas_shadow_ros.bags import BagReader, check_bag, read_run, write_run
+from csas_shadow_ros.cli import main
+from csas_shadow_ros.core.geometry import GroundGrid
+from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
+from csas_shadow_ros.core.sector import Sector
+from csas_shadow_ros.nodes.playing import BagViews
+from csas_shadow_ros.process import replay_bag
+from csas_shadow_ros.simulation.sectors import sectors_of_run
+from msg_adapters import RosbagsMessages
+from msg_adapters.pairs import coherent_image_to_msgs
+
+
+@pytest.fixture(scope="module")
+def run(tiny_box_bag):
+    return read_run(tiny_box_bag.path)
+
+
+@pytest.fixture(scope="module")
+def sectors(run):
+    return [sector for sector, _ in sectors_of_run(run.image, run.track, 30.0)]
+
+
+def written(path: Path, run, sectors) -> Path:
+    return write_run(path, None, run.track, sectors=sectors)
+
+
+def with_band(sector: Sector, **changed: float) -> Sector:
+    return replace(sector, acoustics=replace(sector.acoustics, **changed))
+
+
+def texts(report, level: str) -> str:
+    return "\n".join(str(f) for f in report.findings if f.level == level)
+
+
+def test_right_sectors_are_usable_and_told_of(run, sectors, tmp_path, capsys) -> None:
+    bag = written(tmp_path / "right", run, sectors)
+    report = check_bag(bag)
+    assert report.ok
+    assert texts(report, "warning") == ""
+    assert "away from the sonar, as they must" in texts(report, "info")
+    assert main(["info", str(bag)]) == 0
+    told = capsys.readouterr().out
+    assert "sectors 12 that cover 360.0 of 360°" in told
+    assert "image (summed from the sectors)" in told
+
+
+def test_a_band_that_is_worked_out_anew_for_each_sector_is_the_same_band(run, sectors, tmp_path) -> None:
+    errors = np.random.default_rng(0).uniform(-1e-12, 1e-12, len(sectors))
+    shaken = [
+        with_band(s, centre_frequency_hz=s.acoustics.centre_frequency_hz * (1 + error))
+        for s, error in zip(sectors, errors, strict=True)
+    ]
+    bag = written(tmp_path / "shaken", run, shaken)
+    assert check_bag(bag).ok
+    found = read_run(bag)
+    np.testing.assert_array_equal(
+        found.coherent_image().pixels, read_run(written(tmp_path / "a", run, sectors)).coherent_image().pixels
+    )
+    assert found.problems == []
+
+
+@pytest.mark.parametrize("wrong", [0, 5])
+@pytest.mark.parametrize("what", ["grid", "band"])
+def test_one_wrong_sector_is_named_and_the_others_are_summed(run, sectors, tmp_path, what, wrong) -> None:
+    odd = list(sectors)
+    one = odd[wrong]
+    if what == "grid":
+        g = one.grid
+        grid = GroundGrid(g.rows, g.cols, g.spacing_m, g.x_min_m + 0.05, g.y_max_m)
+        odd[wrong] = replace(one, grid=grid)
+    else:
+        odd[wrong] = with_band(one, centre_frequency_hz=70e3)
+    bag = written(tmp_path / "odd", run, odd)
+    found = read_run(bag)
+    right = read_run(written(tmp_path / "rest", run, [s for i, s in enumerate(sectors) if i != wrong]))
+    np.testing.assert_array_equal(found.coherent_image().pixels, right.coherent_image().pixels)
+    [problem] = found.problems
+    assert f"another {what} than 11 other sectors" in str(problem)
+    assert "expected" in str(problem)
+    report = check_bag(bag)
+    assert not report.ok
+    assert f"another {what}" in texts(report, "error")
+    played = BagViews(BagReader(bag), "sector")
+    assert one.stamp_ns not in played.times
+    assert len(played.times) == 11
+    assert any(f"another {what}" in line for line in played.problems)
+
+
+def test_arcs_that_no_sector_covers_are_named_by_check_info_and_run(run, sectors, tmp_path, capsys) -> None:
+    bag = written(tmp_path / "gap", run, [s for i, s in enumerate(sectors) if i not in (3, 4)])
+    gap = "no sectors came of 90.0° to 150.0°: 60 of 360 degrees are missing"
+    assert gap in texts(check_bag(bag), "warning")
+    assert main(["info", str(bag)]) == 0
+    assert "missing: 90.0° to 150.0°" in capsys.readouterr().out
+    out = ["--out", str(tmp_path / "out"), "--step-deg", "15", "--voxel-size-m", "0.05"]
+    assert main(["run", str(bag), *out, "--no-bag", "--no-figures", "--max-objects", "1"]) == 0
+    assert gap in capsys.readouterr().err
+    assert gap in (tmp_path / "out" / "report.json").read_text(encoding="utf-8").replace("\\u00b0", "°")
+
+
+def test_the_same_arc_under_two_stamps_is_told_of(run, sectors, tmp_path) -> None:
+    again = replace(sectors[5], stamp_ns=sectors[-1].stamp_ns + 10**9)
+    warned = texts(check_bag(written(tmp_path / "twice", run, [*sectors, again])), "warning")
+    assert str(again.stamp_ns) in warned
+    assert "it counts twice" in warned
+
+
+def test_what_contradicts_itself_in_all_sectors_is_an_error_as_in_an_image(run, sectors, tmp_path) -> None:
+    turned = [with_band(s, spectrum_sign=-1) for s in sectors]
+    assert "spectrum_sign is -1" in texts(check_bag(written(tmp_path / "sign", run, turned)), "error")
+    lower = written(tmp_path / "band", run, [with_band(s, centre_frequency_hz=30e3) for s in sectors])
+    assert "energy lies in its stated band" in texts(check_bag(lower), "error")
+
+
+def test_of_a_stamp_that_comes_again_the_first_image_is_played_each_time(run, sectors, tmp_path) -> None:
+    again = replace(sectors[4], stamp_ns=sectors[3].stamp_ns)
+    bag = written(tmp_path / "again", run, [*sectors[:4], again, *sectors[5:]])
+    played = BagViews(BagReader(bag), "sector")
+    first = {stamp: played.get(stamp) for stamp in played.times}
+    for _ in range(2):
+        for stamp in played.times:
+            assert played.get(stamp) == first[stamp]
+
+
+def test_replay_plays_the_sectors_where_the_image_cannot_be_used(run, sectors, tmp_path) -> None:
+    pytest.importorskip("rclpy")
+    image, info = coherent_image_to_msgs(RosbagsMessages(), run.image)
+    data = np.array(image.data)
+    data.view(np.float32)[17] = math.nan
+    extra = [("image", replace(image, data=data)), ("camera_info", info)]
+    bag = write_run(tmp_path / "nan", None, run.track, sectors=sectors, extra=extra)
+    parameters = PipelineParameters(
+        sub_aperture=SubApertureParameters(step_deg=15.0), carving=CarvingParameters(voxel_size_m=0.05)
+    )
+    report = replay_bag(bag, tmp_path / "out", parameters, write_bag=False, figures=False)
+    assert report["dimensions"] is not None
+    assert any("message 0" in problem for problem in report["problems"])
