@@ -142,6 +142,9 @@ class CsasNode(LifecycleNode):
     def finish(self) -> None:
         """Bring what must survive to an end; called on deactivation and shutdown."""
 
+    def warm_up(self) -> None:
+        """Load what the first view would have to wait for."""
+
     def on_activated(self) -> None:
         """Do what is to be done once when the work begins."""
 
@@ -352,6 +355,8 @@ class CsasNode(LifecycleNode):
         self._beat_thread = threading.Thread(target=self._beat_on, name="heartbeat", daemon=True)
         self._send_beats()
         self._beat_thread.start()
+        # Heartbeats go on meanwhile: others know already that this node is there.
+        self.warm_up()
         self.on_activated()
         for source in self.sources:
             source.wake()

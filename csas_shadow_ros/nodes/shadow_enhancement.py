@@ -8,6 +8,7 @@ from typing import Any
 from csas_shadow_ros.core.errors import NoTargetError
 from csas_shadow_ros.core.parameters import ShadowParameters
 from csas_shadow_ros.core.shadow import enhance
+from csas_shadow_ros.core.warm import warm_enhancement
 from msg_adapters import view_from_msgs
 
 from .base import PUBLISHED, CsasNode, Inlet, TargetInlet, ViewOutlet, run_node
@@ -24,6 +25,10 @@ class ShadowEnhancementNode(CsasNode):
         self.shadow = ViewOutlet(self, "shadow")
         self.target = TargetInlet(self, lambda: self.inlet.release())
         self.inlet = Inlet(self, "sub_aperture", "stage", self.work, hold=self.target.missing)
+
+    def warm_up(self) -> None:
+        """Load the kernels."""
+        warm_enhancement()
 
     def waiting(self) -> str:
         """Say so if views wait for the target."""

@@ -8,6 +8,7 @@ from typing import Any
 from csas_shadow_ros.core.likelihood import outside_likelihood, view_levels
 from csas_shadow_ros.core.parameters import LikelihoodParameters
 from csas_shadow_ros.core.segmentation import segment_shadow
+from csas_shadow_ros.core.warm import warm_likelihood
 from msg_adapters import view_from_msgs
 
 from .base import PUBLISHED, CsasNode, Inlet, TargetInlet, ViewOutlet, run_node
@@ -35,6 +36,10 @@ class ShadowLikelihoodNode(CsasNode):
     def _open_mask(self) -> None:
         if self.target.target is not None and self.mask is None:
             self.mask = ViewOutlet(self, "shadow_mask")
+
+    def warm_up(self) -> None:
+        """Load the kernels."""
+        warm_likelihood()
 
     def forget(self) -> None:
         """Drop the mask's publisher."""

@@ -16,6 +16,7 @@ from csas_shadow_ros.core.parameters import SubApertureParameters, TargetParamet
 from csas_shadow_ros.core.streaming import Stream
 from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.core.target import Target, choose_target, find_target, spectrum_sign_evidence
+from csas_shadow_ros.core.warm import warm_sub_apertures
 from msg_adapters import (
     Heartbeat,
     Pairer,
@@ -59,6 +60,10 @@ class SubApertureNode(CsasNode):
         self.begin_guard = self.trigger(self.begin)
         self.stream_guard = self.trigger(self.advance)
         self.every(0.05, self.begin_again)
+
+    def warm_up(self) -> None:
+        """Load the kernels."""
+        warm_sub_apertures()
 
     def forget(self) -> None:
         """Drop the run."""

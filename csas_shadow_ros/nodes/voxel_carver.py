@@ -18,6 +18,7 @@ from csas_shadow_ros.core.mesh import Dimensions, measure, mesh_from_grid
 from csas_shadow_ros.core.parameters import CarvingParameters
 from csas_shadow_ros.core.segmentation import require_silhouette
 from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.warm import warm_carving
 from msg_adapters import Heartbeat, mesh_to_msg, view_from_msgs, voxel_grid_to_msgs, voxels_to_msg
 
 from . import qos
@@ -50,6 +51,10 @@ class VoxelCarverNode(CsasNode):
         self.follow_sources()
         # More often than a node's own tick: a sector's last view is to be shown at once.
         self.every(0.02, self.show)
+
+    def warm_up(self) -> None:
+        """Load the kernels."""
+        warm_carving(CarvingParameters(method=self.parameters.method))
 
     def forget(self) -> None:
         """Drop the grid."""

@@ -1,0 +1,116 @@
+"""Load the compiled kernels of each stage before the first view needs them.
+
+Numba keeps kernels on disk and loads each when it is first called, and some libraries are imported when they are
+first used. A stream's first sectors would wait for all of that, one stage after the other.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from .geometry import (
+    Acoustics,
+    GroundGrid,
+    ShadowCamera,
+    Track,
+    View,
+    ViewInfo,
+    unit_to_sonar,
+    view_ground_to_pixel,
+)
+from .parameters import CarvingParameters, SubApertureParameters
+
+# Stages are imported where they are warmed: no process loads those of another.
+
+_SIDE, _SPACING_M = 96, 0.02
+_ACOUSTICS = Acoustics(60e3, 20e3, 1500.0, 1)
+_SONAR_M = (20.0, 0.0, 6.0)
+_TARGET_M = (0.0, 0.0)
+
+
+def _speckle(*shape: int) -> np.ndarray[tuple[int, ...], np.dtype[np.complex64]]:
+    rng = np.random.default_rng(0)
+    return (rng.normal(size=shape) + 1j * rng.normal(size=shape)).astype(np.complex64)
+
+
+def sample_view() -> View:
+    """Make a small sub-aperture view: a seabed of speckle, and a shadow behind an echo at the origin."""
+    to_pixel = view_ground_to_pixel(0.0, _SPACING_M, _SIDE, _SIDE, _TARGET_M)
+    camera = ShadowCamera.from_ground(to_pixel, _SONAR_M, _SIDE, _SIDE)
+    info = ViewInfo(1, camera, _ACOUSTICS, 0.0, math.radians(12.0), (-100.0, 0.0))
+    pixels = _speckle(_SIDE, _SIDE)
+    half = _SIDE // 2
+    pixels[half - 6 : half, half - 12 : half + 12] *= 20.0
+    pixels[half : half + 30, half - 12 : half + 12] *= 0.05
+    return View(info, pixels)
+
+
+def _shadow_view() -> View:
+    """Return the sample's amplitudes, as of an enhanced view."""
+    view = sample_view()
+    return replace(view, pixels=np.abs(view.pixels).astype(np.float32))
+
+
+def warm_enhancement() -> View:
+    """Enhance a sample view; return it."""
+    from .shadow import enhance
+
+    return enhance(sample_view(), _TARGET_M)
+
+
+def warm_likelihood(view: View | None = None) -> View:
+    """Take a sample view through levels, likelihood and segmentation; return the silhouette."""
+    from .likelihood import outside_likelihood, view_levels
+    from .segmentation import require_silhouette, segment_shadow
+
+    shadow = view or _shadow_view()
+    levels = view_levels(shadow)
+    outside_likelihood(shadow, None, levels)
+    return require_silhouette(segment_shadow(shadow, _TARGET_M, None, levels, reach_m=0.3))
+
+
+def warm_carving(parameters: CarvingParameters | None = None) -> None:
+    """Carve a few voxels with a sample view by a method, and look at them as at the end of a run."""
+    from .carving import Carver
+    from .mesh import measure, mesh_from_grid
+    from .volume import Volume
+
+    p = parameters or CarvingParameters()
+    shadow = _shadow_view()
+    if p.takes_masks:
+        pixels = np.where(shadow.pixels < 0.5, np.uint8(255), np.uint8(0))
+        pixels[:10] = 64  # covered pixels: the second look is taken
+    else:
+        pixels = np.clip(shadow.pixels, 0.0, 1.0)
+    view = replace(shadow, pixels=pixels)
+    carver = Carver(Volume.around(_TARGET_M, (0.6, 0.6, 0.3), 0.05), p)
+    carver.integrate(view)
+    grid = carver.grid()
+    occupied = np.zeros(grid.volume.shape, bool)
+    occupied[:3, 4:8, 4:8] = True
+    measure(mesh_from_grid(replace(grid, occupied=occupied, likelihood=np.where(occupied, 0.0, 1.0))))
+
+
+def warm_sub_apertures() -> None:
+    """Sum two small sectors, and make a view of the sum."""
+    from .sector import Sector
+    from .streaming import SectorSum
+    from .subaperture import SubApertures
+
+    theta = np.linspace(0.0, 2.0 * math.pi, 180, endpoint=False)
+    circle = np.column_stack([20.0 * np.cos(theta), 20.0 * np.sin(theta), np.full(theta.size, 6.0)])
+    track = Track(np.arange(theta.size) * 1_000_000_000, circle)
+    spacing = 0.004
+    grid = GroundGrid(_SIDE, _SIDE, spacing, -spacing * _SIDE / 2.0, spacing * _SIDE / 2.0)
+    total = SectorSum()
+    for stamp, aspect in enumerate((0.0, math.radians(30.0)), start=1):
+        f_c = _ACOUSTICS.centre_frequency_hz
+        k = _ACOUSTICS.ground_wavenumber(f_c, track.grazing_rad) * unit_to_sonar(aspect)
+        carrier = (float(k[0]), float(k[1]))
+        pixels = _speckle(_SIDE, _SIDE)
+        total.add(Sector(pixels, grid, _ACOUSTICS, stamp, aspect, math.radians(30.0), carrier))
+    made = SubApertures(total.frame, track, SubApertureParameters(), spectrum=total.spectrum)
+    made.view_of_aspect(0.2)
