@@ -1,7 +1,7 @@
 """Load the compiled kernels of each stage before the first view needs them.
 
-Numba keeps kernels on disk and loads each when it is first called, and some libraries are imported when they are
-first used. A stream's first sectors would wait for all of that, one stage after the other.
+Numba keeps kernels on disk and loads each when it is first called, and some libraries are imported when they
+are first used. A stream's first sectors would wait for all of that, one stage after the other.
 """
 
 from __future__ import annotations

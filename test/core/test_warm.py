@@ -1,4 +1,4 @@
-"""What is loaded ahead is what a run then uses: nothing is left to be compiled or imported by the first view."""
+"""What is loaded ahead is what a run then uses: the first view has nothing left to wait for."""
 
 from __future__ import annotations
 
