@@ -43,6 +43,8 @@ VIEWS, SIDE, SECONDS = 360, 800, 6.0
 #: What an ordinary mouse sends.
 MOUSE_HZ = 125
 DRAGS = 5
+#: Times that a finished run is opened, each in a browser of its own.
+OPENINGS = 3
 
 
 def speckle(rng: np.random.Generator) -> NDArray[np.float32]:
@@ -223,7 +225,9 @@ def main() -> int:
     report: dict[str, Any] = {"cores": os.cpu_count(), "load": round(os.getloadavg()[0], 2)}
     report["synthetic"] = measure(synthetic_store())
     if arguments.results is not None:
-        report["results"] = opened(arguments.results)
+        times = [opened(arguments.results) for _ in range(OPENINGS)]
+        report["results"] = {name: round(float(np.median([t[name] for t in times]))) for name in times[0]}
+        report["results"]["command_to_picture_ms_each"] = [t["command_to_picture_ms"] for t in times]
     print(json.dumps(report, indent=2))
     return 0
 
