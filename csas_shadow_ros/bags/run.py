@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from csas_shadow_ros.core.errors import BagError, CsasError
 from csas_shadow_ros.core.geometry import CoherentImage, Track, View
-from csas_shadow_ros.core.sector import Sector, same_band, same_grid
+from csas_shadow_ros.core.sector import Sector, unlike
 from msg_adapters.camera_info import SectorInfo, sector_info_from_msg
 from msg_adapters.image import largest_part, quantise
 from msg_adapters.messages import RosbagsMessages, stamp_to_ns
@@ -102,6 +102,7 @@ class Run:
     problems: list[Problem] = field(default_factory=list)
     _reader: BagReader | None = None
     _sum: SectorSum | None = None
+    _infos: list[SectorInfo] | None = None
 
     def views(self, stream_name: str) -> Iterator[View]:
         """Iterate the views of a stage: `sub_aperture`, `shadow`, `likelihood` or `shadow_mask`.
@@ -120,8 +121,15 @@ class Run:
         return self._each("sector", sector_from_msgs)
 
     def sector_infos(self) -> list[SectorInfo]:
-        """Return what the legible sectors say of themselves, each stamp once."""
-        return [] if self._reader is None else sector_infos(self._reader)
+        """Return what the legible sectors say of themselves, each stamp once; read once, without pixels."""
+        if self._infos is None:
+            self._infos = []
+            if self._reader is not None:
+                for _, message, _ in checked_messages(self._reader, "sector/camera_info", lambda _: None):
+                    # What is not legible is named where the sectors are read.
+                    with contextlib.suppress(CsasError):
+                        self._infos.append(sector_info_from_msg(message))
+        return self._infos
 
     def sector_sum(self) -> SectorSum:
         """Return the sum of the sectors; it is made once.
@@ -201,22 +209,12 @@ class Run:
             self.problems.append(problem)
 
 
-def sector_infos(reader: BagReader) -> list[SectorInfo]:
-    """Return what the legible sectors of a bag say of themselves, each stamp once."""
-    found: list[SectorInfo] = []
-    for _, message, _ in checked_messages(reader, "sector/camera_info", lambda _: None):
-        # What is not legible is named where the sectors are read.
-        with contextlib.suppress(CsasError):
-            found.append(sector_info_from_msg(message))
-    return found
-
-
 def odd_sectors(infos: Iterable[SectorInfo]) -> dict[int, str]:
     """Return, by stamp, why a sector is not like most: one that is wrong must not make the others wrong."""
     kinds: list[list[SectorInfo]] = []
     for info in infos:
         for kind in kinds:
-            if same_grid(kind[0].grid, info.grid) and same_band(kind[0].acoustics, info.acoustics):
+            if unlike(info, kind[0]) is None:
                 kind.append(info)
                 break
         else:
@@ -226,11 +224,9 @@ def odd_sectors(infos: Iterable[SectorInfo]) -> dict[int, str]:
     most = max(kinds, key=len)
     reasons: dict[int, str] = {}
     for kind in kinds:
-        if kind is not most:
-            what = "band" if same_grid(most[0].grid, kind[0].grid) else "grid"
-            field_name = "grid" if what == "grid" else "acoustics"
-            own, expected = getattr(kind[0], field_name), getattr(most[0], field_name)
-            reason = f"has another {what} than {len(most)} other sectors: {own}; expected {expected}"
+        if differs := unlike(kind[0], most[0]):
+            what, values = differs
+            reason = f"has another {what} than {len(most)} other sectors: {values}"
             reasons |= {info.stamp_ns: reason for info in kind}
     return reasons
 

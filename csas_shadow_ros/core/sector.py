@@ -5,13 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import GeometryError
 from .geometry import Acoustics, CoherentImage, GroundGrid
+
+
+class HasBand(Protocol):
+    """A sector, or what is known of one before its pixels are read."""
+
+    @property
+    def grid(self) -> GroundGrid: ...
+    @property
+    def acoustics(self) -> Acoustics: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +90,15 @@ def same_band(a: Acoustics, b: Acoustics) -> bool:
             (a.sound_speed_mps, b.sound_speed_mps),
         )
     )
+
+
+def unlike(own: HasBand, expected: HasBand) -> tuple[str, str] | None:
+    """Say in what a sector differs, ``grid`` or ``band``, with both values; None if in neither."""
+    if not same_grid(own.grid, expected.grid):
+        return "grid", f"{own.grid}; expected {expected.grid}"
+    if not same_band(own.acoustics, expected.acoustics):
+        return "band", f"{own.acoustics}; expected {expected.acoustics}"
+    return None
 
 
 def image_from_sectors(sectors: Iterable[Sector]) -> CoherentImage:

@@ -24,7 +24,7 @@ from .errors import GeometryError, NoTargetError, ViewError
 from .geometry import TWO_PI, CoherentImage, Track
 from .parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from .pipeline import ProcessedView, process_view
-from .sector import Sector, same_band, same_grid
+from .sector import Sector, unlike
 from .subaperture import Spectrum, SubApertures
 from .target import Target, choose_target, find_target, spectrum_sign_evidence
 from .threads import in_order
@@ -203,15 +203,12 @@ class SectorSum:
         first = self._first
         if first is None:
             return
-        for what, same, own, expected in (
-            ("grid", same_grid(first.grid, sector.grid), sector.grid, first.grid),
-            ("band", same_band(first.acoustics, sector.acoustics), sector.acoustics, first.acoustics),
-        ):
-            if not same:
-                raise GeometryError(
-                    f"sector at {sector.stamp_ns} ns has another {what} than the first, at"
-                    f" {first.stamp_ns} ns: {own}; expected {expected}"
-                )
+        if differs := unlike(sector, first):
+            what, values = differs
+            raise GeometryError(
+                f"sector at {sector.stamp_ns} ns has another {what} than the first, at"
+                f" {first.stamp_ns} ns: {values}"
+            )
 
     def _add(self, sector: Sector, arc: Arc, energy: float) -> float:
         """Add a sector's arc of the spectrum; return how far it reaches beyond the sector's."""

@@ -54,22 +54,22 @@ def _shadow_view() -> View:
     return replace(view, pixels=np.abs(view.pixels).astype(np.float32))
 
 
-def warm_enhancement() -> View:
-    """Enhance a sample view; return it."""
+def warm_enhancement() -> None:
+    """Enhance a sample view."""
     from .shadow import enhance
 
-    return enhance(sample_view(), _TARGET_M)
+    enhance(sample_view(), _TARGET_M)
 
 
-def warm_likelihood(view: View | None = None) -> View:
-    """Take a sample view through levels, likelihood and segmentation; return the silhouette."""
+def warm_likelihood() -> None:
+    """Take a sample view through levels, likelihood and segmentation."""
     from .likelihood import outside_likelihood, view_levels
-    from .segmentation import require_silhouette, segment_shadow
+    from .segmentation import segment_shadow
 
-    shadow = view or _shadow_view()
+    shadow = _shadow_view()
     levels = view_levels(shadow)
     outside_likelihood(shadow, None, levels)
-    return require_silhouette(segment_shadow(shadow, _TARGET_M, None, levels, reach_m=0.3))
+    segment_shadow(shadow, _TARGET_M, None, levels, reach_m=0.3)
 
 
 def warm_carving(parameters: CarvingParameters | None = None) -> None:

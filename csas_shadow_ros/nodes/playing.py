@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections import OrderedDict
 from collections.abc import Iterator
 from typing import Any
 
 from csas_shadow_ros.bags import BagReader
-from csas_shadow_ros.bags.run import odd_sectors, sector_infos
-from csas_shadow_ros.core.errors import BagError, ParameterError
+from csas_shadow_ros.bags.run import odd_sectors
+from csas_shadow_ros.core.errors import BagError, CsasError, ParameterError
 from msg_adapters import TOPICS, VIEW_STREAMS
+from msg_adapters.camera_info import sector_info_from_msg
 from msg_adapters.messages import NANOSECONDS
 from msg_adapters.topics import stream as stream_of
 
@@ -106,16 +108,19 @@ class BagViews:
         #: Recording time (ns) of each stamp, in the order of recording.
         self.times: dict[int, int] = {}
         self._infos: dict[int, bytes] = {}
+        sectors = []
         for message in reader.messages([self._kind.info_topic]):
             stamp = self._stamp(message)
             if stamp is not None and stamp not in self._infos:
                 self._infos[stamp] = bytes(message.cdr)
                 self.times[stamp] = message.log_time_ns
-        if stream == "sector":
-            # The graph takes the first for right; of a bag it is known what most are like.
-            for stamp, reason in odd_sectors(sector_infos(reader)).items():
-                self.problems.append(f"{self._kind.image_topic} ({stamp} ns): {reason}")
-                del self._infos[stamp], self.times[stamp]
+                if stream == "sector":
+                    with contextlib.suppress(CsasError):  # whoever takes it names what is not legible
+                        sectors.append(sector_info_from_msg(message.decode()))
+        # The graph takes the first for right; of a bag it is known what most are like.
+        for stamp, reason in odd_sectors(sectors).items():
+            self.problems.append(f"{self._kind.image_topic} ({stamp} ns): {reason}")
+            del self._infos[stamp], self.times[stamp]
         self._cursor: Iterator[Any] | None = None
         self._recent: OrderedDict[int, bytes] = OrderedDict()
         #: Stamps of the images that the cursor has passed.

@@ -416,13 +416,22 @@ def test_arrows_move_what_is_on_the_screen_whatever_is_up(watched, serve, run_st
         assert abs(moved[1 - axis]) < 1e-6 * abs(moved[axis]), key
 
 
+def end_of(server: ViewerServer, watched: Any) -> None:
+    server.stop()
+    watched.until("document.querySelector('#link').textContent.includes('away')")
+
+
+def forgive_the_pause(watched: Any) -> None:
+    """Forget what the browser says while there is no server."""
+    watched.said[:] = [s for s in watched.said if "WebSocket" not in s and "ERR_CONNECTION_REFUSED" not in s]
+
+
 def test_another_run_at_the_same_address_leaves_nothing_of_the_first(watched, serve, run_store):
     first = ViewerServer(run_store)
     first.start()
     watched.open(first.url)
     watched.until("csas.solid.sides.main.triangles > 0 && csas.surfaceMeasures")
-    first.stop()
-    watched.until("document.querySelector('#link').textContent.includes('away')")
+    end_of(first, watched)
     other = store_of()
     other.title = "another run"
     serve(other, port=first.port)
@@ -432,7 +441,7 @@ def test_another_run_at_the_same_address_leaves_nothing_of_the_first(watched, se
     assert "surface here" not in watched.page.locator("#dimensions").inner_text()
     for row in ("#row-main", "#row-other"):
         assert not watched.page.locator(row).is_visible()
-    watched.said[:] = [s for s in watched.said if "WebSocket" not in s and "ERR_CONNECTION_REFUSED" not in s]
+    forgive_the_pause(watched)
 
 
 def test_a_run_of_likelihoods_alone_shows_them(watched, serve):
@@ -538,14 +547,13 @@ def test_a_server_that_goes_and_comes_back_is_found_again_without_a_reload(watch
     server.start()
     watched.open(server.url)
     watched.js("window.mark = 1")
-    server.stop()
-    watched.until("document.querySelector('#link').textContent.includes('away')")
+    end_of(server, watched)
     watched.said.clear()
     again = store_of(range(40))
     serve(again, port=server.port)
     watched.until("csas.views('shadow').length === 40")
     assert watched.js("window.mark") == 1
-    watched.said[:] = [s for s in watched.said if "WebSocket" not in s and "ERR_CONNECTION_REFUSED" not in s]
+    forgive_the_pause(watched)
 
 
 def test_the_state_is_json_that_anybody_can_read(watched, serve, run_store):
