@@ -7,41 +7,36 @@ latched topics, and ends its own processes by their ids, whatever happens.
 from __future__ import annotations
 
 import contextlib
-import os
-import random
-import signal
-import socket
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from .bags import read_run
 from .core import errors
-from .core.errors import CsasError, NoTargetError
-from .core.geometry import GroundGrid
-from .core.mesh import Dimensions, measure
+from .core.errors import CsasError, NoTargetError, ParameterError
 from .core.parameters import PipelineParameters
-from .core.stages import target_of_views
-from .core.target import Target
-from .core.threshold import thresholded
-from .core.volume import VoxelGrid
-from .nodes.params import NODES, check, yaml_text
-from .nodes.playing import recorded_streams, stage_of_bag
+from .graph import (
+    Graph,
+    ReplayError,
+    environment_of,
+    free_domain_id,
+    start_fork_server,
+)
+from .nodes.params import NODES
 
+# What takes long to import is imported where it is used: the nodes' processes are on their way meanwhile.
 if TYPE_CHECKING:
     import trimesh
+    from numpy.typing import NDArray
 
-PACKAGE = "csas_shadow_ros"
+    from .core.geometry import GroundGrid
+    from .core.mesh import Dimensions
+    from .core.target import Target
+    from .core.volume import VoxelGrid
+
 #: Stages of a bag, and the nodes that turn each into the next.
 _CHAIN = {
     "image": ("sub_aperture", "shadow_enhancement", "shadow_likelihood", "voxel_carver"),
@@ -52,17 +47,6 @@ _CHAIN = {
     "shadow_mask": ("voxel_carver",),
 }
 _WITH_COMPOSITES = ("image", "sector", "sub_aperture")
-#: Each process has its own numerical libraries: as many threads in each as there are cores would only wait.
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-#: Views are a few MB: by default glibc gives such memory back at once, and a quarter of the nodes' time went
-#: into getting it again, page by page.
-_MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(1 << 26), "MALLOC_TRIM_THRESHOLD_": str(1 << 28)}
-
-
-class ReplayError(CsasError):
-    """The graph could not bring a replay to its end."""
-
-
 @dataclass(frozen=True)
 class NodeReport:
     """What one node says of its part.
@@ -152,238 +136,6 @@ class ReplayResult:
     seconds: float = 0.0
 
 
-def config_file(name: str) -> Path:
-    """Find a file of ``config/``: in the source tree, or where the package was installed.
-
-    Raises
-    ------
-    ReplayError
-        If it is nowhere.
-    """
-    here = Path(__file__).resolve()
-    prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
-    places = [here.parents[1] / "config" / name]
-    places += [Path(prefix) / "share" / PACKAGE / "config" / name for prefix in prefixes if prefix]
-    for place in places:
-        if place.is_file():
-            return place
-    raise ReplayError(f"{name} is nowhere; expected it at one of: {', '.join(map(str, places))}")
-
-
-def free_domain_id() -> int:
-    """Return a ROS domain whose discovery port nobody on this machine uses.
-
-    Raises
-    ------
-    ReplayError
-        If all are in use.
-    """
-    # Linux hands out ports from 32768 on to whoever asks: domains up to 101 lie below them.
-    for domain in random.sample(range(1, 102), 101):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(("", 7400 + 250 * domain))
-            except OSError:
-                continue
-            return domain
-    raise ReplayError("every ROS domain from 1 to 101 is in use on this machine")
-
-
-def graph_environment(domain_id: int, log_dir: Path) -> dict[str, str]:
-    """Return the environment of the graph's processes: this machine alone, shared memory, few threads."""
-    profile = str(config_file("fastdds_shm.xml"))
-    own = {
-        "ROS_DOMAIN_ID": str(domain_id),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "FASTRTPS_DEFAULT_PROFILES_FILE": profile,
-        "FASTDDS_DEFAULT_PROFILES_FILE": profile,
-        "ROS_LOG_DIR": str(log_dir),
-        "CSAS_PARENT_PID": str(os.getpid()),
-    }
-    own.setdefault("AMENT_PREFIX_PATH", os.environ.get("AMENT_PREFIX_PATH", sys.prefix))
-    root = str(Path(__file__).resolve().parents[1])
-    path = os.environ.get("PYTHONPATH", "")
-    own["PYTHONPATH"] = f"{root}{os.pathsep}{path}" if path else root
-    defaults = {**_MEMORY, **dict.fromkeys(_THREADS, "1")}
-    return {**defaults, **os.environ, **own}
-
-
-@contextlib.contextmanager
-def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    before = dict(os.environ)
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
-
-
-class GraphProcess:
-    """One node's process: started, watched, started again, ended by its id.
-
-    Parameters
-    ----------
-    node : str
-        Name of the node.
-    environment : mapping
-        Its environment.
-    log_dir : Path
-        Where its output goes.
-    parameter_file : Path, optional
-        ROS parameter file.
-    """
-
-    def __init__(
-        self, node: str, environment: Mapping[str, str], log_dir: Path, parameter_file: Path | None = None
-    ) -> None:
-        self.node = node
-        self.log = log_dir / f"{node}.log"
-        self.restarts = -1
-        self._environment = dict(environment)
-        self._arguments = ["--ros-args", "--params-file", str(parameter_file)] if parameter_file else []
-        self._process: subprocess.Popen[bytes] | None = None
-        self._log_file: IO[bytes] | None = None
-
-    @property
-    def pid(self) -> int:
-        """Id of the running process.
-
-        Raises
-        ------
-        ReplayError
-            If it was not started.
-        """
-        if self._process is None:
-            raise ReplayError(f"{self.node} was not started")
-        return self._process.pid
-
-    def start(self) -> None:
-        """Start the process, or start it again."""
-        self.close_log()
-        self._log_file = self.log.open("ab")
-        self.restarts += 1
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", f"{PACKAGE}.nodes.{self.node}", *self._arguments],
-            env=self._environment,
-            stdin=subprocess.DEVNULL,
-            stdout=self._log_file,
-            stderr=subprocess.STDOUT,
-            # Not in the terminal's group: on Ctrl-C we end the processes ourselves, in order.
-            start_new_session=True,
-        )
-
-    def poll(self) -> int | None:
-        """Return the exit status, None while the process runs."""
-        return None if self._process is None else self._process.poll()
-
-    def signal(self, number: int) -> None:
-        """Send a signal if the process runs."""
-        if self._process is not None and self._process.poll() is None:
-            self._process.send_signal(number)
-
-    def wait(self, timeout_s: float) -> None:
-        """Wait for the process to end; kill it after the timeout."""
-        if self._process is None:
-            return
-        try:
-            self._process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-
-    def close_log(self) -> None:
-        """Close the log file."""
-        if self._log_file is not None:
-            self._log_file.close()
-            self._log_file = None
-
-    def last_line(self) -> str:
-        """Return the last line of the process' output."""
-        lines = self.log.read_text(errors="replace").strip().splitlines() if self.log.exists() else []
-        return lines[-1] if lines else "no output"
-
-
-class Graph:
-    """The processes of a graph; ends them all when left.
-
-    Parameters
-    ----------
-    parameters : mapping of node name to mapping of parameter name to value
-        One process is started for each node named.
-    domain_id : int
-        ROS domain.
-    log_dir : Path
-        Where logs and the parameter file go.
-    max_restarts : int
-        How often each node may die and be started again.
-    """
-
-    def __init__(
-        self,
-        parameters: Mapping[str, Mapping[str, Any]],
-        domain_id: int,
-        log_dir: Path,
-        max_restarts: int = 3,
-    ) -> None:
-        check(parameters)
-        log_dir.mkdir(parents=True, exist_ok=True)
-        self.environment = graph_environment(domain_id, log_dir)
-        file = log_dir / "parameters.yaml"
-        file.write_text(yaml_text(parameters, only_given=True), encoding="utf-8")
-        has_own = {name for name, own in parameters.items() if own}
-        self.processes = {
-            name: GraphProcess(name, self.environment, log_dir, file if name in has_own else None)
-            for name in parameters
-        }
-        self.parameters = parameters
-        self.max_restarts = max_restarts
-        #: One line for each process that died.
-        self.deaths: list[str] = []
-
-    def __enter__(self) -> Graph:
-        try:
-            for process in self.processes.values():
-                process.start()
-        except BaseException:
-            self.stop()
-            raise
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
-
-    def watch(self) -> None:
-        """Start again what has died.
-
-        Raises
-        ------
-        ReplayError
-            If a node refuses its parameters or its bag, or died too often; the message has its last line.
-        """
-        for name, process in self.processes.items():
-            code = process.poll()
-            if code is None:
-                continue
-            if code == 2:
-                raise ReplayError(f"{name} refused to start: {process.last_line()}")
-            how = f"was killed by signal {-code}" if code < 0 else f"ended with status {code}"
-            self.deaths.append(f"{name} {how}: {process.last_line()}")
-            if process.restarts >= self.max_restarts:
-                raise ReplayError(f"{name} died {process.restarts + 1} times; {self.deaths[-1]}")
-            process.start()
-
-    def stop(self) -> None:
-        """End all processes: asked first, so that a recorder finishes its bag, then killed."""
-        for process in self.processes.values():
-            process.signal(signal.SIGINT)
-        for name, process in self.processes.items():
-            process.wait(30.0 if name == "bag_recorder" else 5.0)
-            process.close_log()
-
-
 class _Watcher:
     """Listens to a graph: progress first, and results once they are complete."""
 
@@ -391,21 +143,21 @@ class _Watcher:
         # Late, so that reading this module needs no ROS.
         import rclpy
         from rclpy.context import Context
-        from rclpy.executors import SingleThreadedExecutor
 
         from msg_adapters import RclpyMessages
 
         from .nodes import qos
+        from .nodes.base import make_executor
 
         self._qos = qos
         self._rclpy = rclpy
         self._messages = RclpyMessages()
         self._context = Context()
         own = {k: v for k, v in graph.environment.items() if k.startswith(("ROS_", "FAST"))}
-        with _environment(own):
+        with environment_of(own):
             rclpy.init(context=self._context, domain_id=domain_id)
             self._node = rclpy.create_node("replay", context=self._context, namespace="csas")
-        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor = make_executor(self._context)
         self._executor.add_node(self._node)
         self.beats: dict[tuple[str, str], Any] = {}
         self._dead: set[str] = set()
@@ -572,10 +324,12 @@ def replay(
         else:
             out = Path(out_dir)
         recording = None if record is False else out / "recording" if record is True else Path(record)
+        domain = free_domain_id() if domain_id is None else domain_id
+        # First of all: it imports libraries while the bag is looked at.
+        server = stack.enter_context(start_fork_server(domain, out / "log"))
         chosen, target = _plan(bag, stage, p)
         plan = _node_plan(bag, chosen, p, target, rate, recording, composites, window, overrides or {})
-        domain = free_domain_id() if domain_id is None else domain_id
-        graph = stack.enter_context(Graph(plan, domain, out / "log", max_restarts))
+        graph = stack.enter_context(Graph(plan, domain, out / "log", max_restarts, server))
         watcher = _Watcher(graph, domain)
         stack.callback(watcher.close)
         done = stack.enter_context(_shown(progress))
@@ -588,7 +342,9 @@ def replay(
 
 def _plan(bag: str | Path, stage: str, p: PipelineParameters) -> tuple[str, Target | None]:
     """Say what is played, and where the target is if no node can find it."""
-    from .bags import BagReader
+    from .bags import BagReader, read_run
+    from .core.stages import target_of_views
+    from .nodes.playing import stage_of_bag
 
     reader = BagReader(bag)
     chosen = stage_of_bag(reader, stage)
@@ -597,7 +353,7 @@ def _plan(bag: str | Path, stage: str, p: PipelineParameters) -> tuple[str, Targ
     hard = p.carving.takes_masks
     if chosen in ("likelihood", "shadow_mask") and (chosen == "shadow_mask") != hard:
         expected = "hard" if chosen == "shadow_mask" else "one that takes likelihoods (soft)"
-        raise errors.ParameterError(f"method is {p.carving.method!r}; expected {expected} for {chosen} views")
+        raise ParameterError(f"method is {p.carving.method!r}; expected {expected} for {chosen} views")
     run = read_run(bag)
     target = target_of_views(lambda: run.views(chosen), chosen, p.target)
     if target is None:
@@ -634,7 +390,7 @@ def _node_plan(
         plan["sub_aperture"]["first_search_deg"] = 360.0
     for name, own in overrides.items():
         if name not in NODES:
-            raise errors.ParameterError(f"unknown node {name!r}; expected one of: {', '.join(NODES)}")
+            raise ParameterError(f"unknown node {name!r}; expected one of: {', '.join(NODES)}")
         if name in plan:
             plan[name] = {**plan[name], **own}
     return plan
@@ -699,6 +455,8 @@ def _until_complete(
 
 
 def _sinks_complete(graph: Graph, watcher: _Watcher) -> bool:
+    from .nodes.playing import recorded_streams
+
     for name in ("voxel_carver", "composites"):
         if name not in graph.processes:
             continue
@@ -722,7 +480,13 @@ def _error_of(node: str, text: str) -> CsasError:
 def _collect(
     watcher: _Watcher, graph: Graph, stage: str, p: PipelineParameters, target: Target | None
 ) -> ReplayResult:
+    import numpy as np
+
     from msg_adapters import ground_picture_from_msgs, mesh_from_msg, target_from_msg, voxel_grid_from_msgs
+
+    from .core.mesh import measure
+    from .core.target import Target
+    from .core.threshold import thresholded
 
     result = ReplayResult(stage, target=target)
     for (node, stream), beat in sorted(watcher.beats.items()):

@@ -26,7 +26,8 @@ class ShadowEnhancementNode(CsasNode):
         self.target = TargetInlet(self, lambda: self.inlet.release())
         self.inlet = Inlet(self, "sub_aperture", "stage", self.work, hold=self.target.missing)
 
-    def warm_up(self) -> None:
+    @classmethod
+    def preload(cls) -> None:
         """Load the kernels."""
         warm_enhancement()
 

@@ -37,7 +37,8 @@ class ShadowLikelihoodNode(CsasNode):
         if self.target.target is not None and self.mask is None:
             self.mask = ViewOutlet(self, "shadow_mask")
 
-    def warm_up(self) -> None:
+    @classmethod
+    def preload(cls) -> None:
         """Load the kernels."""
         warm_likelihood()
 

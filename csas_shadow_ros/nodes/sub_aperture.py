@@ -57,11 +57,12 @@ class SubApertureNode(CsasNode):
         self.subscribe_latched("track", self.take_track)
         self.sector_inlet = Inlet(self, "sector", "sink", self.take_sector)
         self.follow_sources()
-        self.begin_guard = self.trigger(self.begin)
-        self.stream_guard = self.trigger(self.advance)
+        self.beginning = self.background(self.begin)
+        self.advancing = self.background(self.advance)
         self.every(0.05, self.begin_again)
 
-    def warm_up(self) -> None:
+    @classmethod
+    def preload(cls) -> None:
         """Load the kernels."""
         warm_sub_apertures()
 
@@ -139,14 +140,14 @@ class SubApertureNode(CsasNode):
             raise ViewError(f"image stamped {stamp} ns came during a run of sectors; it is not used")
         self.image = coherent_image_from_msgs(*pair)
         self.image_stamp = stamp
-        self.begin_guard.trigger()
+        self.beginning.trigger()
 
     def take_track(self, msg: Any) -> None:
         """Take the track; of a track that grows during the run the longest is the whole."""
         track = track_from_msg(msg)
         if self.stream is not None:
             if self.stream.take_track(track):
-                self.stream_guard.trigger()
+                self.advancing.trigger()
             self.track = self.stream.track
             return
         if self.sub_apertures is not None:
@@ -161,7 +162,7 @@ class SubApertureNode(CsasNode):
                 raise TrackError(f"{problem}. {remedy}")
         if self.track is None or len(track) >= len(self.track):
             self.track = track
-            self.begin_guard.trigger()
+            self.beginning.trigger()
 
     def take_sector(self, image: Any, info: Any) -> str:
         """Take one sector."""
@@ -183,7 +184,7 @@ class SubApertureNode(CsasNode):
         for name, what in _IRREGULAR.items():
             if self.stream.counts[name] > before.get(name, 0):
                 self.log_throttled(name, f"sector at {sector.stamp_ns} ns {what}", "warn")
-        self.stream_guard.trigger()
+        self.advancing.trigger()
         return INTEGRATED
 
     def on_source(self, beat: Heartbeat) -> None:
@@ -194,7 +195,7 @@ class SubApertureNode(CsasNode):
         if here and not self.source_ended:
             self.source_ended = True
             self.stream.finish()
-            self.stream_guard.trigger()
+            self.advancing.trigger()
 
     # A run that comes as sectors
 

@@ -52,9 +52,10 @@ class VoxelCarverNode(CsasNode):
         # More often than a node's own tick: a sector's last view is to be shown at once.
         self.every(0.02, self.show)
 
-    def warm_up(self) -> None:
+    @classmethod
+    def preload(cls) -> None:
         """Load the kernels."""
-        warm_carving(CarvingParameters(method=self.parameters.method))
+        warm_carving()
 
     def forget(self) -> None:
         """Drop the grid."""

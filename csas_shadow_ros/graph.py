@@ -1,0 +1,492 @@
+"""The processes of a node graph: started, watched, started again, ended by their ids."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+from .core.errors import CsasError
+from .nodes.params import check, yaml_text
+
+PACKAGE = "csas_shadow_ros"
+#: The first to be started are those that have most to do before there is a view.
+_START_ORDER = (
+    "bag_player",
+    "sub_aperture",
+    "shadow_enhancement",
+    "shadow_likelihood",
+    "voxel_carver",
+    "composites",
+    "bag_recorder",
+    "viewer",
+)
+#: Each process has its own numerical libraries: as many threads in each as there are cores would only wait.
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+#: Views are a few MB: by default glibc gives such memory back at once, and a quarter of the nodes' time went
+#: into getting it again, page by page.
+_MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(1 << 26), "MALLOC_TRIM_THRESHOLD_": str(1 << 28)}
+
+
+class ReplayError(CsasError):
+    """The graph could not bring a replay to its end."""
+
+
+def config_file(name: str) -> Path:
+    """Find a file of ``config/``: in the source tree, or where the package was installed.
+
+    Raises
+    ------
+    ReplayError
+        If it is nowhere.
+    """
+    here = Path(__file__).resolve()
+    prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
+    places = [here.parents[1] / "config" / name]
+    places += [Path(prefix) / "share" / PACKAGE / "config" / name for prefix in prefixes if prefix]
+    for place in places:
+        if place.is_file():
+            return place
+    raise ReplayError(f"{name} is nowhere; expected it at one of: {', '.join(map(str, places))}")
+
+
+def free_domain_id() -> int:
+    """Return a ROS domain whose discovery port nobody on this machine uses.
+
+    Raises
+    ------
+    ReplayError
+        If all are in use.
+    """
+    # Linux hands out ports from 32768 on to whoever asks: domains up to 101 lie below them.
+    for domain in random.sample(range(1, 102), 101):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("", 7400 + 250 * domain))
+            except OSError:
+                continue
+            return domain
+    raise ReplayError("every ROS domain from 1 to 101 is in use on this machine")
+
+
+def graph_environment(domain_id: int, log_dir: Path) -> dict[str, str]:
+    """Return the environment of the graph's processes: this machine alone, shared memory, few threads."""
+    profile = str(config_file("fastdds_shm.xml"))
+    own = {
+        "ROS_DOMAIN_ID": str(domain_id),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "FASTRTPS_DEFAULT_PROFILES_FILE": profile,
+        "FASTDDS_DEFAULT_PROFILES_FILE": profile,
+        "ROS_LOG_DIR": str(log_dir),
+        "CSAS_PARENT_PID": str(os.getpid()),
+    }
+    own.setdefault("AMENT_PREFIX_PATH", os.environ.get("AMENT_PREFIX_PATH", sys.prefix))
+    root = str(Path(__file__).resolve().parents[1])
+    path = os.environ.get("PYTHONPATH", "")
+    own["PYTHONPATH"] = f"{root}{os.pathsep}{path}" if path else root
+    defaults = {**_MEMORY, **dict.fromkeys(_THREADS, "1")}
+    return {**defaults, **os.environ, **own}
+
+
+@contextlib.contextmanager
+def environment_of(values: Mapping[str, str]) -> Iterator[None]:
+    """Have these variables set for a while."""
+    before = dict(os.environ)
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+
+
+class _Forked:
+    """A child process that a `ForkServer` made; it is used as a `subprocess.Popen` is."""
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self.returncode: int | None = None
+
+    def poll(self) -> int | None:
+        """Return the exit status, minus the number of a signal that ended it; None while it runs."""
+        if self.returncode is None:
+            try:
+                pid, status = os.waitpid(self.pid, os.WNOHANG)
+            except ChildProcessError:
+                # Not ours yet (its maker is about to end), or no more: somebody else waited for it.
+                if _exists(self.pid):
+                    return None
+                pid, status = self.pid, 1 << 8
+            if pid:
+                self.returncode = os.waitstatus_to_exitcode(status)
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end.
+
+        Raises
+        ------
+        subprocess.TimeoutExpired
+            If it runs on.
+        """
+        end = None if timeout is None else time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            if end is not None and time.monotonic() > end:
+                raise subprocess.TimeoutExpired(str(self.pid), timeout or 0.0)
+            time.sleep(0.005)
+        return code
+
+    def send_signal(self, number: int) -> None:
+        """Send it a signal if it runs."""
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        """End it at once."""
+        self.send_signal(signal.SIGKILL)
+
+
+def _exists(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+class ForkServer:
+    """Starts node processes from one that has loaded what they all need (`nodes.fork_server`).
+
+    Parameters
+    ----------
+    environment : mapping
+        Environment of the server and of all processes that it starts.
+    log : Path
+        Where its own output goes.
+
+    Notes
+    -----
+    While it is open this process takes its descendants' orphans in, so that it is the nodes' parent.
+    """
+
+    def __init__(self, environment: Mapping[str, str], log: Path) -> None:
+        self._before = _take_orphans_in(True)
+        self._lock = threading.Lock()
+        self._asked: deque[Future[int]] = deque()
+        with log.open("ab") as output:
+            self._server = subprocess.Popen(
+                [sys.executable, "-m", f"{PACKAGE}.nodes.fork_server"],
+                env=dict(environment),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=output,
+                text=True,
+                start_new_session=True,
+            )
+        self._reader = threading.Thread(target=self._read, name="fork server", daemon=True)
+        self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        """Id of the server's process."""
+        return self._server.pid
+
+    def start(self, node: str, arguments: Sequence[str], log: Path) -> Future[int]:
+        """Have a node started; its process id, or an error, will follow."""
+        answer: Future[int] = Future()
+        request = json.dumps({"node": node, "arguments": list(arguments), "log": str(log)})
+        assert self._server.stdin is not None
+        with self._lock:
+            self._asked.append(answer)
+            try:
+                self._server.stdin.write(request + "\n")
+                self._server.stdin.flush()
+            except (OSError, ValueError) as error:
+                self._asked.remove(answer)
+                answer.set_exception(ReplayError(f"the fork server is gone: {error}"))
+        return answer
+
+    def _read(self) -> None:
+        assert self._server.stdout is not None
+        for line in self._server.stdout:
+            answer = json.loads(line)
+            with self._lock:
+                asked = self._asked.popleft()
+            if "pid" in answer:
+                asked.set_result(answer["pid"])
+            else:
+                asked.set_exception(ReplayError(answer["error"]))
+        with self._lock:
+            left, self._asked = list(self._asked), deque()
+            with contextlib.suppress(OSError):
+                self._server.stdin.close()  # type: ignore[union-attr]
+        for asked in left:
+            asked.set_exception(ReplayError("the fork server has ended"))
+
+    def __enter__(self) -> ForkServer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the server; requests that it has not begun with fail, the processes that it made run on."""
+        self._server.terminate()
+        with self._lock, contextlib.suppress(OSError):
+            self._server.stdin.close()  # type: ignore[union-attr]
+        try:
+            self._server.wait(20.0)
+        except subprocess.TimeoutExpired:
+            self._server.kill()
+            self._server.wait()
+        self._reader.join()
+        _take_orphans_in(self._before)
+
+
+def start_fork_server(domain_id: int, log_dir: Path) -> contextlib.AbstractContextManager[ForkServer | None]:
+    """Start a fork server for a graph; None where the system has no such thing.
+
+    Parameters
+    ----------
+    domain_id : int
+        ROS domain of the graph.
+    log_dir : Path
+        Where logs go.
+    """
+    log_dir.mkdir(parents=True, exist_ok=True)
+    try:
+        return ForkServer(graph_environment(domain_id, log_dir), log_dir / "fork_server.log")
+    except ReplayError:
+        return contextlib.nullcontext()
+
+
+def _take_orphans_in(on: bool) -> bool:
+    """Say whether orphaned descendants shall become this process' children; return whether they did before.
+
+    Raises
+    ------
+    ReplayError
+        If the system cannot do that.
+    """
+    set_, get_ = 36, 37  # PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER of Linux
+    before = ctypes.c_int(0)
+    try:
+        prctl = ctypes.CDLL(None, use_errno=True).prctl
+    except (AttributeError, OSError) as error:
+        raise ReplayError(f"no prctl here: {error}") from None
+    if prctl(get_, ctypes.byref(before), 0, 0, 0) or prctl(set_, int(on), 0, 0, 0):
+        raise ReplayError(f"prctl: {os.strerror(ctypes.get_errno())}")
+    return bool(before.value)
+
+
+class GraphProcess:
+    """One node's process: started, watched, started again, ended by its id.
+
+    Parameters
+    ----------
+    node : str
+        Name of the node.
+    environment : mapping
+        Its environment.
+    log_dir : Path
+        Where its output goes.
+    parameter_file : Path, optional
+        ROS parameter file.
+    server : ForkServer, optional
+        Starts it, as long as it can; by default the process is an interpreter of its own from the beginning.
+    """
+
+    def __init__(
+        self,
+        node: str,
+        environment: Mapping[str, str],
+        log_dir: Path,
+        parameter_file: Path | None = None,
+        server: ForkServer | None = None,
+    ) -> None:
+        self.node = node
+        self.log = log_dir / f"{node}.log"
+        self.restarts = -1
+        self._environment = dict(environment)
+        self._arguments = ["--ros-args", "--params-file", str(parameter_file)] if parameter_file else []
+        self._server = server
+        self._coming: Future[int] | None = None
+        self._process: subprocess.Popen[bytes] | _Forked | None = None
+        self._log_file: IO[bytes] | None = None
+
+    @property
+    def pid(self) -> int:
+        """Id of the running process; waits until there is one.
+
+        Raises
+        ------
+        ReplayError
+            If it was not started.
+        """
+        self._arrive(wait=True)
+        if self._process is None:
+            raise ReplayError(f"{self.node} was not started")
+        return self._process.pid
+
+    def start(self) -> None:
+        """Start the process, or start it again."""
+        self.restarts += 1
+        self._process = None
+        if self._server is None:
+            self._start_alone()
+        else:
+            self._coming = self._server.start(self.node, self._arguments, self.log)
+
+    def _start_alone(self) -> None:
+        self.close_log()
+        self._log_file = self.log.open("ab")
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", f"{PACKAGE}.nodes.{self.node}", *self._arguments],
+            env=self._environment,
+            stdin=subprocess.DEVNULL,
+            stdout=self._log_file,
+            stderr=subprocess.STDOUT,
+            # Not in the terminal's group: on Ctrl-C we end the processes ourselves, in order.
+            start_new_session=True,
+        )
+
+    def _arrive(self, *, wait: bool, fall_back: bool = True) -> None:
+        """Take the process from the server; start it alone if the server could not."""
+        coming = self._coming
+        if coming is None or not (wait or coming.done()):
+            return
+        self._coming = None
+        try:
+            self._process = _Forked(coming.result())
+        except ReplayError:
+            if fall_back:
+                self._start_alone()
+
+    def poll(self) -> int | None:
+        """Return the exit status, None while the process runs."""
+        self._arrive(wait=False)
+        return None if self._process is None else self._process.poll()
+
+    def signal(self, number: int) -> None:
+        """Send a signal if the process runs."""
+        self._arrive(wait=True, fall_back=False)
+        if self._process is not None and self._process.poll() is None:
+            self._process.send_signal(number)
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait for the process to end; kill it after the timeout."""
+        if self._process is None:
+            return
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def close_log(self) -> None:
+        """Close the log file."""
+        if self._log_file is not None:
+            self._log_file.close()
+            self._log_file = None
+
+    def last_line(self) -> str:
+        """Return the last line of the process' output."""
+        lines = self.log.read_text(errors="replace").strip().splitlines() if self.log.exists() else []
+        return lines[-1] if lines else "no output"
+
+
+class Graph:
+    """The processes of a graph; ends them all when left.
+
+    Parameters
+    ----------
+    parameters : mapping of node name to mapping of parameter name to value
+        One process is started for each node named.
+    domain_id : int
+        ROS domain.
+    log_dir : Path
+        Where logs and the parameter file go.
+    max_restarts : int
+        How often each node may die and be started again.
+    server : ForkServer, optional
+        Starts the processes; by default each is an interpreter of its own from the beginning.
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Mapping[str, Any]],
+        domain_id: int,
+        log_dir: Path,
+        max_restarts: int = 3,
+        server: ForkServer | None = None,
+    ) -> None:
+        check(parameters)
+        log_dir.mkdir(parents=True, exist_ok=True)
+        self.environment = graph_environment(domain_id, log_dir)
+        file = log_dir / "parameters.yaml"
+        file.write_text(yaml_text(parameters, only_given=True), encoding="utf-8")
+        has_own = {name for name, own in parameters.items() if own}
+        self.processes = {
+            name: GraphProcess(name, self.environment, log_dir, file if name in has_own else None, server)
+            for name in parameters
+        }
+        self.parameters = parameters
+        self.max_restarts = max_restarts
+        #: One line for each process that died.
+        self.deaths: list[str] = []
+
+    def __enter__(self) -> Graph:
+        try:
+            for process in sorted(self.processes.values(), key=lambda p: _START_ORDER.index(p.node)):
+                process.start()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def watch(self) -> None:
+        """Start again what has died.
+
+        Raises
+        ------
+        ReplayError
+            If a node refuses its parameters or its bag, or died too often; the message has its last line.
+        """
+        for name, process in self.processes.items():
+            code = process.poll()
+            if code is None:
+                continue
+            if code == 2:
+                raise ReplayError(f"{name} refused to start: {process.last_line()}")
+            how = f"was killed by signal {-code}" if code < 0 else f"ended with status {code}"
+            self.deaths.append(f"{name} {how}: {process.last_line()}")
+            if process.restarts >= self.max_restarts:
+                raise ReplayError(f"{name} died {process.restarts + 1} times; {self.deaths[-1]}")
+            process.start()
+
+    def stop(self) -> None:
+        """End all processes: asked first, so that a recorder finishes its bag, then killed."""
+        for process in self.processes.values():
+            process.signal(signal.SIGINT)
+        for name, process in self.processes.items():
+            process.wait(30.0 if name == "bag_recorder" else 5.0)
+            process.close_log()

@@ -1,0 +1,120 @@
+"""A process that nodes are forked from: what they all load is loaded once.
+
+A node alone imports libraries and loads compiled kernels for one to two seconds of processor time, six
+nodes for ten on two cores. Here the first has to, the next have only what is their own left to load, and
+a node that is started again begins to work at once.
+
+Requests come as lines of JSON on standard input: ``{"node": name, "arguments": [...], "log": path}``.
+Each is answered on standard output, in order: ``{"pid": number}``, or ``{"error": text}``. The process ends
+with its input. A node's parent is not this process but the nearest ancestor that takes orphans in
+(``PR_SET_CHILD_SUBREAPER``): its end can be waited for there, and it lives on if this process dies.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import json
+import os
+import signal
+import sys
+import time
+import traceback
+from typing import Any
+
+from .base import CsasNode
+
+
+def load(node: str) -> Any:
+    """Import a node's module, load what its first view needs, and return the function that runs it.
+
+    Raises
+    ------
+    ImportError
+        If there is no such node, or a library of it is missing.
+    """
+    module = importlib.import_module(f"{__package__}.{node}")
+    for kind in CsasNode.__subclasses__():
+        if kind.name == node:
+            kind.preload()
+    return module.main
+
+
+def fork(node: str, arguments: list[str], log: str, answers: int) -> int:
+    """Start a node in a process of its own, whose parent is not this one; return its id.
+
+    Parameters
+    ----------
+    node, arguments, log : str, list of str, str
+        As in a request.
+    answers : int
+        Descriptor that the node must not hold: whoever reads from it waits for its end.
+    """
+    main = load(node)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # What is loaded stays shared: the collector would write into every page of it.
+    gc.collect()
+    gc.freeze()
+    reader, writer = os.pipe()
+    between = os.fork()
+    if between == 0:
+        pid = os.fork()
+        if pid == 0:
+            for descriptor in (reader, writer, answers):
+                os.close(descriptor)
+            _become(main, node, arguments, log)
+        os.write(writer, str(pid).encode())
+        os._exit(0)
+    os.close(writer)
+    os.waitpid(between, 0)
+    with open(reader, "rb") as pipe:
+        return int(pipe.read())
+
+
+def _become(main: Any, node: str, arguments: list[str], log: str) -> None:
+    """Be the node from here on; never returns."""
+    code = 1
+    try:
+        # Not in the terminal's group: on Ctrl-C whoever started the graph ends its processes, in order.
+        os.setsid()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            # As in `start.run`: nothing has begun that would have to be brought to an end.
+            signal.signal(number, lambda *_: os._exit(0))
+        output = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        for source, target in ((nothing, 0), (output, 1), (output, 2)):
+            os.dup2(source, target)
+        sys.argv = [node, *arguments]
+        parent = int(os.environ.get("CSAS_PARENT_PID", "0"))
+        deadline = time.monotonic() + 1.0
+        while parent and os.getppid() != parent and time.monotonic() < deadline:
+            time.sleep(0.001)  # whoever forked us is about to end; then we are our starter's child
+        code = main()
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def main() -> int:
+    """Serve requests until there are no more."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Answers go to what was standard output; whatever a library prints must not come between them.
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.set_inheritable(answers.fileno(), False)
+    os.dup2(2, 1)
+    for line in sys.stdin:
+        request = json.loads(line)
+        try:
+            answer: dict[str, int | str] = {"pid": fork(request["node"], request["arguments"], request["log"], answers.fileno())}
+        except Exception as error:
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        answers.write(json.dumps(answer) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
