@@ -35,6 +35,7 @@ from csas_shadow_ros.core.echo import layover_per_metre
 from csas_shadow_ros.core.geometry import ShadowCamera, Track, View, ViewInfo
 from csas_shadow_ros.core.hollows import EchoLook, _looks, _surface
 from csas_shadow_ros.core.likelihood import Levels, box_mean
+from csas_shadow_ros.core.local_means import LocalMeans
 from csas_shadow_ros.core.parameters import (
     CarvingParameters,
     PipelineParameters,
@@ -147,15 +148,13 @@ def _print_search(evidence: SignEvidence, best: Target | None, true_m: tuple[flo
     print(f"  target {math.hypot(*best.position_m):.2f} m off its place, volume {size} m for {true} m")
 
 
-def _mixture(
-    power: NDArray[np.float32], known: NDArray[np.bool_], start_db: float
-) -> tuple[float, float] | None:
+def _mixture(local: LocalMeans, start_db: float) -> tuple[float, float] | None:
     """Fit two exponentials to the powers of a view (Rayleigh amplitudes) by expectation-maximisation.
 
     In place of `likelihood.fit_contrast`: refused where the contrast is more than 6 dB off the hypothesis, or
     the shadow takes less than a thousandth of the view.
     """
-    values = power[known][::7].astype(np.float64)
+    values = local.power[local.known][::7].astype(np.float64)
     values = values[values < 6.0]  # the rest is echoes
     share, shadow, seabed = 0.1, 10.0 ** (-start_db / 10.0), 1.0
     for _ in range(100):

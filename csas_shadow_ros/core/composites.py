@@ -7,14 +7,61 @@ three planes of memory whatever the number of views.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from skimage.color import hsv2rgb
 
 from .errors import ParameterError, check_range
 from .geometry import TWO_PI, GroundGrid, View
+
+
+FloatImage = NDArray[np.float32]
+
+
+def _power(pixels: NDArray[Any]) -> FloatImage:
+    """Return |i|² of complex or amplitude pixels."""
+    if not np.iscomplexobj(pixels):
+        return np.square(pixels, dtype=np.float32)
+    out = np.empty(pixels.shape, np.float32)
+    _power_of_parts(np.ascontiguousarray(pixels, np.complex64).view(np.float32), out)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _power_of_parts(parts: FloatImage, out: FloatImage) -> None:  # pragma: no cover
+    rows, cols = out.shape
+    for v in range(rows):
+        line, to = parts[v], out[v]
+        for u in range(cols):
+            to[u] = line[2 * u] * line[2 * u] + line[2 * u + 1] * line[2 * u + 1]
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(
+    warped: FloatImage,
+    cosine: np.float32,
+    sine: np.float32,
+    power: FloatImage,
+    count: FloatImage,
+    east: FloatImage,
+    north: FloatImage,
+) -> None:  # pragma: no cover
+    """Add a view's power to the sums where it is finite: the view knows nothing elsewhere."""
+    rows, cols = warped.shape
+    for v in range(rows):
+        line = warped[v]
+        p, n, x, y = power[v], count[v], east[v], north[v]
+        for u in range(cols):
+            known = line[u] < np.float32(np.inf)
+            value = line[u] if known else np.float32(0.0)
+            p[u] += value
+            n[u] += np.float32(known)
+            x[u] += value * cosine
+            y[u] += value * sine
 
 
 class Composites:
@@ -29,7 +76,7 @@ class Composites:
     def __init__(self, grid: GroundGrid) -> None:
         self.grid = grid
         self._power = np.zeros(grid.shape, np.float32)
-        self._resultant = np.zeros((*grid.shape, 2), np.float32)
+        self._resultant = np.zeros((2, *grid.shape), np.float32)
         self._count = np.zeros(grid.shape, np.float32)
         #: Stamps of the views that have been integrated.
         self.stamps: set[int] = set()
@@ -55,7 +102,7 @@ class Composites:
         """
         if view.info.stamp_ns in self.stamps:
             return False
-        power = np.square(np.abs(view.pixels)).astype(np.float32)
+        power = _power(view.pixels)
         # Output pixel → ground → view pixel: what cv2 calls the inverse map.
         to_view = view.info.camera.ground_to_pixel @ np.linalg.inv(self.grid.ground_to_pixel)
         warped = cv2.warpAffine(
@@ -66,13 +113,9 @@ class Composites:
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=math.nan,
         )
-        known = np.isfinite(warped)
-        warped = np.where(known, warped, np.float32(0))
-        self._power += warped
-        self._count += known
         aspect = view.info.aspect_rad
-        self._resultant[..., 0] += warped * np.float32(math.cos(aspect))
-        self._resultant[..., 1] += warped * np.float32(math.sin(aspect))
+        planes = (self._power, self._count, *self._resultant)
+        _add(warped, np.float32(math.cos(aspect)), np.float32(math.sin(aspect)), *planes)
         self.stamps.add(view.info.stamp_ns)
         return True
 
@@ -91,9 +134,9 @@ class Composites:
         anisotropy : ndarray of float32, shape (rows, cols)
             |Σ P û| / Σ P: 0 the same from all sides, 1 seen from one side only.
         """
-        length = np.hypot(self._resultant[..., 0], self._resultant[..., 1])
+        length = np.hypot(*self._resultant)
         anisotropy = length / np.maximum(self._power, np.finfo(np.float32).tiny)
-        aspect = np.mod(np.arctan2(self._resultant[..., 1], self._resultant[..., 0]), TWO_PI)
+        aspect = np.mod(np.arctan2(self._resultant[1], self._resultant[0]), TWO_PI)
         return aspect.astype(np.float32), np.clip(anisotropy, 0, 1).astype(np.float32)
 
     def color_by_aspect(self, dynamic_range_db: float = 35.0) -> NDArray[np.uint8]:

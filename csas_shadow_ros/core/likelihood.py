@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
 
 import cv2
 import numba
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from .errors import ViewError
 from .geometry import View
+from .local_means import LocalMeans
 from .parameters import LikelihoodParameters
 
 FloatImage = NDArray[np.float32]
@@ -45,24 +48,31 @@ class Levels:
         Fraction of the known pixels inside shadows; NaN if it was not measured.
     estimated : bool
         Whether σ_s was measured (True) or comes from the contrast hypothesis.
-    power : ndarray of float32, shape (rows, cols)
-        (i/σ_r)²/2, which has mean 1 on the seabed; 0 where unknown.
-    known : ndarray of bool, shape (rows, cols)
-        Pixels that the view knows.
+    local : LocalMeans
+        The view's power, and its means over boxes.
     """
 
     seabed_level: float
     contrast: float
     shadow_fraction: float
     estimated: bool
-    power: FloatImage
-    known: NDArray[np.bool_]
+    local: LocalMeans
     _echoes: dict[float, NDArray[np.bool_]] = field(default_factory=dict, repr=False)
+
+    @property
+    def power(self) -> FloatImage:
+        """(i/σ_r)²/2, which has mean 1 on the seabed; 0 where unknown. Shape (rows, cols)."""
+        return self.local.power
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Pixels that the view knows, shape (rows, cols)."""
+        return self.local.known
 
     def echoes(self, echo_db: float) -> NDArray[np.bool_]:
         """Return `echo_mask` of the view, worked out once: likelihood and segmentation both ask for it."""
         if echo_db not in self._echoes:
-            self._echoes[echo_db] = echo_mask(self.power, self.known, echo_db)
+            self._echoes[echo_db] = echo_mask(self.local, echo_db)
         return self._echoes[echo_db]
 
 
@@ -119,6 +129,20 @@ def _surface(v: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.float
     return np.stack([np.ones_like(v), v, u, v * v, v * u, u * u], axis=-1)
 
 
+@lru_cache(maxsize=1)
+def _lattice_surface() -> NDArray[np.float64]:
+    nodes = np.linspace(-1, 1, _LATTICE)
+    return _surface(*np.meshgrid(nodes, nodes, indexing="ij"))
+
+
+def _median(values: NDArray[Any]) -> float:
+    """Return the median of finite numbers; `numpy.median` costs ten times as much on a few hundred."""
+    middle = values.size // 2
+    if values.size % 2:
+        return float(np.partition(values, middle, axis=None)[middle])
+    return float(np.partition(values, (middle - 1, middle), axis=None)[middle - 1 : middle + 1].mean())
+
+
 def seabed_level(amplitude: FloatImage, background: str) -> FloatImage:
     """Estimate σ_r, the seabed's Rayleigh mode, on a coarse lattice over a view: the surface is smooth.
 
@@ -161,23 +185,21 @@ def seabed_level(amplitude: FloatImage, background: str) -> FloatImage:
     if medians.size == 0:
         raise ViewError("the seabed level of the view is zero; expected an amplitude image with a lit seabed")
     log_level = np.log(medians)
-    middle = float(np.median(log_level))
+    middle = _median(log_level)
     if background == "global" or medians.size < 24:
         return np.full((_LATTICE, _LATTICE), math.exp(middle) / _MEDIAN_OVER_MODE, np.float32)
     design = _surface(v, u)
+    # A little damping of slope and curvature: where outliers cover much of the view, stay flat.
+    damping = np.diag([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])
     coefficients: NDArray[np.float64] = np.zeros(6)
     coefficients[0] = middle
     for _ in range(8):
         residual = log_level - design @ coefficients
-        scale = max(1.4826 * float(np.median(np.abs(residual))), 0.02)
-        weight = np.clip(1.0 - (residual / (4.0 * scale)) ** 2, 0.0, None) ** 2
-        # A little damping of slope and curvature: where outliers cover much of the view, stay flat.
-        normal = (design * weight[:, None]).T @ design + np.diag([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])
-        right = (design * weight[:, None]).T @ log_level
-        coefficients = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
-    nodes = np.linspace(-1, 1, _LATTICE)
-    coarse = _surface(*np.meshgrid(nodes, nodes, indexing="ij")) @ coefficients
-    return np.exp(coarse).astype(np.float32) / np.float32(_MEDIAN_OVER_MODE)
+        scale = max(1.4826 * _median(np.abs(residual)), 0.02)
+        weight = np.maximum(1.0 - (residual / (4.0 * scale)) ** 2, 0.0) ** 2
+        weighted = design.T * weight
+        coefficients = np.asarray(np.linalg.solve(weighted @ design + damping, weighted @ log_level))
+    return np.exp(_lattice_surface() @ coefficients).astype(np.float32) / np.float32(_MEDIAN_OVER_MODE)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -198,12 +220,13 @@ def _relative_power(
         for u in range(cols):
             j = node[u]
             line[u] = here[j] + part[u] * (here[j + 1] - here[j])
+        # Rows of their own: the compiler then makes vectors of what it does with them.
+        pixels, powers, here = amplitude[v], power[v], known[v]
         for u in range(cols):
-            ratio = amplitude[v, u] / line[u]
+            ratio = pixels[u] / line[u]
             value = np.float32(0.5) * ratio * ratio
-            finite = value < np.float32(np.inf)
-            known[v, u] = finite
-            power[v, u] = value if finite else np.float32(0.0)
+            powers[u] = value if value < np.float32(np.inf) else np.float32(0.0)
+            here[u] = value < np.float32(np.inf)
         if v % 8 == 0:
             level[v // 8] = line[::8]
 
@@ -227,7 +250,7 @@ def box_mean(power: FloatImage, known: NDArray[np.bool_], radius_px: tuple[int, 
     return np.asarray(np.divide(total, weight, out=total), dtype=np.float32)
 
 
-def fit_contrast(power: FloatImage, known: NDArray[np.bool_], start_db: float) -> tuple[float, float] | None:
+def fit_contrast(local: LocalMeans, start_db: float) -> tuple[float, float] | None:
     """Measure σ_r/σ_s on the view's own shadows.
 
     Shadows are found first, as patches of low mean power, and the level is that of their interiors:
@@ -235,10 +258,8 @@ def fit_contrast(power: FloatImage, known: NDArray[np.bool_], start_db: float) -
 
     Parameters
     ----------
-    power : ndarray of float32, shape (rows, cols)
-        (i/σ_r)²/2; 0 where unknown.
-    known : ndarray of bool, shape (rows, cols)
-        Pixels that the view knows.
+    local : LocalMeans
+        Of the view's power (i/σ_r)²/2.
     start_db : float
         Contrast to start from.
 
@@ -247,21 +268,23 @@ def fit_contrast(power: FloatImage, known: NDArray[np.bool_], start_db: float) -
     (contrast, shadow_fraction) or None
         None where the view holds no shadow to measure: the fit is then refused rather than trusted.
     """
-    smooth = box_mean(power, known, (2, 2))
     contrast2 = 10.0 ** (start_db / 10.0)
-    kernel = np.ones((5, 5), np.uint8)
-    count, total = 0, int(np.count_nonzero(known))
+    # A pixel is inside a shadow if all of its 5×5 neighbours are dark: if the brightest of them is.
+    brightest = cv2.dilate(local.mean((2, 2)), np.ones((5, 5), np.uint8))
+    # Halfway between the two levels in dB; patches of 5×5 looks seldom cross it by chance. No threshold
+    # that is asked for below lies higher than that of the least contrast.
+    inside = brightest < np.float32(min(contrast2, _MIN_CONTRAST2) ** -0.5)
+    levels, powers = brightest[inside], local.power[inside]
+    count = 0
     for _ in range(3):
-        # Halfway between the two levels in dB; patches of 5×5 looks seldom cross it by chance.
-        dark = ((smooth < contrast2**-0.5) & known).view(np.uint8)
-        interior = cv2.erode(dark, kernel)
-        count = cv2.countNonZero(interior)
+        interior = powers[levels < contrast2**-0.5]
+        count = interior.size
         if count < _MIN_SHADOW_PIXELS:
             return None
-        contrast2 = 1.0 / max(float(cv2.mean(power, interior)[0]), 1e-6)
+        contrast2 = 1.0 / max(float(interior.mean(dtype=np.float64)), 1e-6)
         if contrast2 < _MIN_CONTRAST2:
             return None
-    return math.sqrt(contrast2), count / total
+    return math.sqrt(contrast2), count / local.total_known
 
 
 def view_levels(view: View, parameters: LikelihoodParameters | None = None) -> Levels:
@@ -287,29 +310,25 @@ def view_levels(view: View, parameters: LikelihoodParameters | None = None) -> L
     power, known = np.empty(amplitude.shape, np.float32), np.empty(amplitude.shape, np.bool_)
     seabed = np.empty(tuple(-(-n // 8) for n in amplitude.shape), np.float32)
     _relative_power(amplitude, seabed_level(amplitude, p.background), power, known, seabed)
-    contrast, fraction, estimated = 10.0 ** (p.shadow_contrast_db / 20.0), math.nan, False
-    if p.shadow_level == "estimated":
-        fit = fit_contrast(power, known, p.shadow_contrast_db)
-        if fit is not None:
-            contrast, fraction, estimated = *fit, True
-    return Levels(float(np.median(seabed)), contrast, fraction, estimated, power, known)
+    local = LocalMeans(power, known)
+    fit = fit_contrast(local, p.shadow_contrast_db) if p.shadow_level == "estimated" else None
+    contrast, fraction = fit or (10.0 ** (p.shadow_contrast_db / 20.0), math.nan)
+    return Levels(_median(seabed), contrast, fraction, fit is not None, local)
 
 
-def echo_mask(power: FloatImage, known: NDArray[np.bool_], echo_db: float) -> NDArray[np.bool_]:
+def echo_mask(local: LocalMeans, echo_db: float) -> NDArray[np.bool_]:
     """Mark echoes: pixels whose 3×3 mean power is `echo_db` above the seabed's.
 
     Parameters
     ----------
-    power : ndarray of float32, shape (rows, cols)
-        (i/σ_r)²/2; 0 where unknown.
-    known : ndarray of bool, shape (rows, cols)
-        Pixels that the view knows.
+    local : LocalMeans
+        Of the view's power (i/σ_r)²/2.
     echo_db : float
         Threshold over the seabed's mean power 2σ_r², dB.
     """
-    bright = box_mean(power, known, (1, 1)) > np.float32(10.0 ** (echo_db / 10.0))
+    bright = local.over((1, 1), 10.0 ** (echo_db / 10.0))
     # One pixel more: the flank of an echo's response is neither seabed nor shadow.
-    return cv2.dilate((bright & known).view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
+    return cv2.dilate(bright.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
 
 
 def outside_likelihood(

@@ -30,6 +30,7 @@ from scipy.optimize import nnls
 from .carving import MASK_SHADOW, MASK_UNKNOWN
 from .geometry import TWO_PI, View, ViewInfo, cross_range_axis, down_range_axis
 from .likelihood import Levels
+from .local_means import LocalMeans
 from .mesh import Dimensions, measure
 from .volume import VoxelGrid
 
@@ -164,7 +165,7 @@ def levels_of_mask(mask: View) -> Levels:
     """Stand in for the levels of a view of which only the silhouette is there, such as one drawn by hand."""
     known = mask.pixels != MASK_UNKNOWN
     power = (known & (mask.pixels != MASK_SHADOW)).astype(np.float32)
-    return Levels(math.nan, _DRAWN_CONTRAST, math.nan, False, power, np.asarray(known))
+    return Levels(math.nan, _DRAWN_CONTRAST, math.nan, False, LocalMeans(power, np.asarray(known)))
 
 
 def _largest_piece(shadow: NDArray[np.bool_]) -> NDArray[np.bool_] | None:

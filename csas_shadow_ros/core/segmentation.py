@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .carving import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from .errors import ViewError
 from .geometry import View, ViewInfo
-from .likelihood import Levels, box_mean, view_levels
+from .likelihood import Levels, view_levels
 from .parameters import LikelihoodParameters
 
 #: Shadow where the local mean power is less than this far from the shadow's level to the seabed's. At a
@@ -48,9 +48,8 @@ def dark_pixels(levels: Levels, info: ViewInfo) -> NDArray[np.bool_]:
     """
     cells = zip(_HALF_CELLS, info.resolution_m, info.camera.spacing_m, strict=True)
     rows, cols = (int(min(max(round(half * cell / pixel), 1), _MAX_RADIUS)) for half, cell, pixel in cells)
-    power = box_mean(levels.power, levels.known, (rows, cols))
     shadow_power = 1.0 / levels.contrast**2
-    dark = power < np.float32(shadow_power + _DARK * (1.0 - shadow_power))
+    dark = levels.local.under((rows, cols), shadow_power + _DARK * (1.0 - shadow_power))
     # A threshold below one half draws a straight edge across the box in by a known part of it: the far end
     # of the shadow, which tells the height, is put back.
     dark = _drawn_down(dark, round((0.5 - _DARK) * (2 * rows + 1)))
@@ -102,14 +101,29 @@ def segment_shadow(
     p = parameters or LikelihoodParameters()
     levels = levels or view_levels(view, p)
     shadow = _of_target(dark_pixels(levels, view.info), view, target_m, reach_m)
-    mask = np.full(levels.known.shape, MASK_OUTSIDE, np.uint8)
-    if p.echo_unknown:
-        echo = levels.echoes(p.echo_db)
-        mask[_before_shadow(shadow, echo)] = MASK_COVERED
-        mask[echo] = MASK_UNKNOWN
-    mask[shadow] = MASK_SHADOW
-    mask[~levels.known] = MASK_UNKNOWN
+    echo = levels.echoes(p.echo_db) if p.echo_unknown else np.zeros_like(shadow)
+    covered = _before_shadow(shadow, echo) if p.echo_unknown else echo
+    mask = np.empty(shadow.shape, np.uint8)
+    _compose(levels.known.ravel(), shadow.ravel(), echo.ravel(), covered.ravel(), mask.ravel())
     return replace(view, pixels=mask)
+
+
+@numba.njit(cache=True, nogil=True)
+def _compose(
+    known: NDArray[np.bool_],
+    shadow: NDArray[np.bool_],
+    echo: NDArray[np.bool_],
+    covered: NDArray[np.bool_],
+    mask: NDArray[np.uint8],
+) -> None:  # pragma: no cover
+    """Say of every pixel what it is."""
+    outside, unknown = np.uint8(MASK_OUTSIDE), np.uint8(MASK_UNKNOWN)
+    dark, hidden = np.uint8(MASK_SHADOW), np.uint8(MASK_COVERED)
+    for i in range(mask.size):
+        value = hidden if covered[i] else outside
+        value = unknown if echo[i] else value
+        value = dark if shadow[i] else value
+        mask[i] = value if known[i] else unknown
 
 
 def _of_target(
@@ -169,22 +183,26 @@ def _mark_before(
 ) -> None:  # pragma: no cover
     """Mark, up-range of every stretch of shadow in every column, what an echo leads up to."""
     rows, cols = shadow.shape
-    for j in range(cols):
-        start = -1
-        for i in range(rows + 1):
+    # Row by row, as they lie in memory: where each column's stretch began, if it is in one.
+    starts = np.full(cols, -1, np.int32)
+    for i in range(rows + 1):
+        for j in range(cols):
+            start = starts[j]
             dark = i < rows and shadow[i, j]
-            if dark and start < 0:
-                start = i
-            elif not dark and start >= 0:
-                reach = max(0, start - (i - start))
-                begin = max(reach, start - flank)
-                for k in range(reach, start):
-                    if edge[k, j]:
-                        begin = min(begin, k)
-                        break
-                for k in range(begin, start):
-                    out[k, j] = True
-                start = -1
+            if dark == (start >= 0):
+                continue
+            if dark:
+                starts[j] = i
+                continue
+            reach = max(0, start - (i - start))
+            begin = max(reach, start - flank)
+            for k in range(reach, start):
+                if edge[k, j]:
+                    begin = min(begin, k)
+                    break
+            for k in range(begin, start):
+                out[k, j] = True
+            starts[j] = -1
 
 
 def _before_shadow(shadow: NDArray[np.bool_], echo: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -103,6 +103,20 @@ def _shrink_rows(known: NDArray[np.bool_], margins: NDArray[np.int64]) -> None: 
                 known[i, j] = False
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _known_amplitudes(
+    parts: NDArray[np.float32], known: NDArray[np.bool_], out: NDArray[np.float32]
+) -> None:  # pragma: no cover
+    """Take the amplitudes of known pixels; NaN where unknown. `parts` may have longer rows than `out`."""
+    rows, cols = out.shape
+    for i in range(rows):
+        line, here, to = parts[i], known[i], out[i]
+        for j in range(cols):
+            # In double precision: a square of float32 overflows at 2e19.
+            re, im = np.float64(line[2 * j]), np.float64(line[2 * j + 1])
+            to[j] = np.float32(math.sqrt(re * re + im * im)) if here[j] else np.float32(np.nan)
+
+
 @dataclass(frozen=True, eq=False)
 class _Focused:
     """A focused view in parts: up to row `first` its pixels are the view's own, from there on `rows`."""
@@ -199,8 +213,11 @@ def enhance(view: View, target_m: tuple[float, float], parameters: ShadowParamet
     """
     f = _focus(view, target_m, parameters)
     amplitude = np.empty(f.pixels.shape, np.float32)
-    np.abs(f.pixels[: f.first], out=amplitude[: f.first])
-    behind: NDArray[np.complex64] = f.rows[:, : f.info.camera.cols]
-    np.abs(behind, out=amplitude[f.first :])
-    np.putmask(amplitude, ~f.known, np.float32(np.nan))
+    _known_amplitudes(_parts(f.pixels[: f.first]), f.known[: f.first], amplitude[: f.first])
+    _known_amplitudes(_parts(f.rows), f.known[f.first :], amplitude[f.first :])
     return View(f.info, amplitude)
+
+
+def _parts(pixels: NDArray[np.complex64]) -> NDArray[np.float32]:
+    """View complex rows as rows of real and imaginary parts in turns."""
+    return pixels.view(np.float32)

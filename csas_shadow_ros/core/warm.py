@@ -114,3 +114,11 @@ def warm_sub_apertures() -> None:
         total.add(Sector(pixels, grid, _ACOUSTICS, stamp, aspect, math.radians(30.0), carrier))
     made = SubApertures(total.frame, track, SubApertureParameters(), spectrum=total.spectrum)
     made.view_of_aspect(0.2)
+
+
+def warm_composites() -> None:
+    """Add a sample view to the images of the circle."""
+    from .composites import Composites
+
+    view = sample_view()
+    Composites.for_view(view).integrate(view)

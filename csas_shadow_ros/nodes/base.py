@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 import re
@@ -855,6 +856,10 @@ def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> in
         finally:
             node.stop()
             node.destroy_node()
+            # The lifecycle's own entities hold the participant, and its shared memory, until they are
+            # collected; a process that was forked comes to no interpreter's end that would do it.
+            del node
+            gc.collect()
     finally:
         rclpy.try_shutdown(context=context)
     return code

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from csas_shadow_ros.core.composites import Composites
 from csas_shadow_ros.core.geometry import Acoustics
+from csas_shadow_ros.core.warm import warm_composites
 from msg_adapters import GroundInfo, Heartbeat, ground_picture_to_msgs, view_from_msgs
 from msg_adapters.topics import stream as stream_of
 
@@ -38,6 +39,11 @@ class CompositesNode(CsasNode):
         self.growing = Growing(self.publish_result, self.wanted, self.parameters.publish_hz)
         self.inlet = Inlet(self, "sub_aperture", "sink", self.work)
         self.follow_sources()
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load the kernels."""
+        warm_composites()
 
     def forget(self) -> None:
         """Drop the images."""

@@ -13,6 +13,7 @@ from csas_shadow_ros.core import pipeline
 from csas_shadow_ros.core.geometry import Acoustics, ShadowCamera, ViewInfo
 from csas_shadow_ros.core.hollows import EchoLook, matter_mesh, matter_of
 from csas_shadow_ros.core.likelihood import Levels
+from csas_shadow_ros.core.local_means import LocalMeans
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.stages import run_views
 from csas_shadow_ros.core.volume import Volume, VoxelGrid
@@ -81,7 +82,7 @@ def look_at(body, info, silent=None):
     mean[v[seen & answers], u[seen & answers]] = 1.0
     coarse = rng.exponential(size=tuple(n // 2 + 1 for n in camera.shape)).repeat(2, 0).repeat(2, 1)
     power = (mean * coarse[: camera.shape[0], : camera.shape[1]]).astype(np.float32)
-    return EchoLook.of(Levels(1.0, 4.0, 0.1, True, power, np.ones(camera.shape, bool)), info, VOLUME)
+    return EchoLook.of(Levels(1.0, 4.0, 0.1, True, LocalMeans(power, np.ones(camera.shape, bool))), info, VOLUME)
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +140,7 @@ def test_a_look_holds_the_same_bits_round_the_target_as_the_whole_view_and_is_sm
     rng = np.random.default_rng(3)
     known = rng.random(info.camera.shape) < 0.95
     power = np.where(known, rng.exponential(size=known.shape), 0.0).astype(np.float32)
-    levels = Levels(1.0, 4.0, 0.1, True, power, known)
+    levels = Levels(1.0, 4.0, 0.1, True, LocalMeans(power, known))
     look = EchoLook.of(levels, info, VOLUME)
     whole = EchoLook.of(levels, info, Volume.around(MIDDLE, (20.0, 20.0, 0.3), 0.1))
     assert whole.shape == info.camera.shape

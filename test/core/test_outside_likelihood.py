@@ -19,6 +19,7 @@ from csas_shadow_ros.core.likelihood import (
     seabed_level,
     view_levels,
 )
+from csas_shadow_ros.core.local_means import LocalMeans
 from csas_shadow_ros.core.parameters import LikelihoodParameters, ShadowParameters, SubApertureParameters
 from csas_shadow_ros.core.shadow import enhance
 from csas_shadow_ros.core.subaperture import SubApertures
@@ -191,7 +192,7 @@ def test_levels_given_are_levels_used():
 def mask_of(amplitude, echo_db=8.0):
     known = np.isfinite(amplitude)
     power = (np.nan_to_num(amplitude).astype(np.float32) ** 2 / 2).astype(np.float32)
-    return echo_mask(power, known, echo_db)
+    return echo_mask(LocalMeans(power, known), echo_db)
 
 
 def test_a_bright_patch_is_an_echo_and_speckle_is_not():

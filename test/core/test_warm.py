@@ -8,6 +8,7 @@ import sys
 import pytest
 
 STAGES = {
+    "composites": ("warm_composites()", "composites"),
     "enhancement": ("warm_enhancement()", "shadow"),
     "likelihood": ("warm_likelihood()", "segmentation"),
     "carving": ("warm_carving()", "carving"),

@@ -66,7 +66,7 @@ def test_shadows_of_the_chips_fall_downwards(chips):
 def _echo_axis(view, mirror):
     """Axis of a view's bright echo on the ground: a doubled-angle vector, the longer the clearer."""
     levels = view_levels(view)
-    echo = echo_mask(levels.power, levels.known, 12.0)
+    echo = echo_mask(levels.local, 12.0)
     rows, cols = np.nonzero(echo[:, ::-1] if mirror else echo)
     pixels = np.column_stack([cols, rows, np.ones(len(rows))])
     ground = pixels @ view.info.camera.pixel_to_ground[:2].T
