@@ -295,19 +295,20 @@ def check_pixels(pixels: NDArray[Any], kind: ImageStream) -> None:
         raise AdapterError(f"{where} holds only zeros; expected an image")
 
 
-#: Whether a byte may be in a mask.
-_NO_MASK = np.ones(256, np.bool_)
-_NO_MASK[[0, 64, 128, 255]] = False
+#: The bytes that may be in a mask.
+_MASK = bytes((0, 64, 128, 255))
 
 
 def _plainly_fine(pixels: NDArray[Any], kind: ImageStream) -> bool:
     """Say whether lowest and highest number alone show that pixels keep the rule, as they mostly do."""
     if kind.content == "mask":
-        return pixels.dtype == np.uint8 and not _NO_MASK[pixels].any()
+        return pixels.dtype == np.uint8 and not pixels.tobytes().translate(None, _MASK)
     if kind.content == "count" or pixels.dtype not in (np.complex64, np.complex128, np.float32):
         return False
-    # A sum of parts is finite only where both are.
-    numbers = pixels.real + pixels.imag if np.iscomplexobj(pixels) else pixels
+    numbers = pixels
+    if np.iscomplexobj(pixels):
+        # Real and imaginary parts as they lie in memory, without a copy.
+        numbers = np.ascontiguousarray(pixels).view(pixels.real.dtype)
     if kind.content == "coherent":  # where NaN may not be; it passes through min and max
         low, high = float(numbers.min()), float(numbers.max())
     else:

@@ -18,14 +18,13 @@ from skimage.color import hsv2rgb
 from .errors import ParameterError, check_range
 from .geometry import TWO_PI, GroundGrid, View
 
-
 FloatImage = NDArray[np.float32]
 
 
 def _power(pixels: NDArray[Any]) -> FloatImage:
     """Return |i|² of complex or amplitude pixels."""
     if not np.iscomplexobj(pixels):
-        return np.square(pixels, dtype=np.float32)
+        return np.asarray(np.square(pixels), dtype=np.float32)
     out = np.empty(pixels.shape, np.float32)
     _power_of_parts(np.ascontiguousarray(pixels, np.complex64).view(np.float32), out)
     return out
@@ -105,7 +104,7 @@ class Composites:
         power = _power(view.pixels)
         # Output pixel → ground → view pixel: what cv2 calls the inverse map.
         to_view = view.info.camera.ground_to_pixel @ np.linalg.inv(self.grid.ground_to_pixel)
-        warped = cv2.warpAffine(
+        warped: Any = cv2.warpAffine(
             power,
             to_view[:2],
             (self.grid.cols, self.grid.rows),

@@ -1,8 +1,8 @@
 """Means over boxes of a view's known pixels, of any size at the same small cost.
 
-Levels, echoes and shadow each need the mean power around every pixel, over boxes of different sizes. Power and known
-pixels are summed up once (summed-area tables); a box's mean is then four look-ups, and most of
-those that ask want to know only on which side of a threshold it lies.
+Levels, echoes and shadow each need the mean power around every pixel, over boxes of different sizes.
+Power and known pixels are summed up once (summed-area tables); a box's mean is then four look-ups, and
+most of those that ask want to know only on which side of a threshold it lies.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 FloatImage = NDArray[np.float32]
 BoolImage = NDArray[np.bool_]
 
-#: A pixel counts with this power at most (70 dB above the seabed): more would drown the sums of all pixels behind
-#: it in rounding, and no box of 3×3 with such a pixel in it is under any threshold that can be set (60 dB).
+#: A pixel counts with this power at most (70 dB above the seabed): more would drown the sums of all pixels
+#: behind it in rounding, and no box of 3×3 with one in it is under a threshold that can be set (60 dB).
 MOST_POWER = 1e7
 
 

@@ -35,6 +35,7 @@ from .geometry import (
     view_ground_to_pixel,
 )
 from .parameters import SubApertureParameters
+from .taps import interpolate_4x4
 
 #: Taps of the interpolation kernel along each axis.
 _TAPS = 4
@@ -158,6 +159,11 @@ def _kernel_table() -> NDArray[np.float32]:
     return np.asarray(np.i0(_kaiser_beta() * np.sqrt(inside)), dtype=np.float32)
 
 
+@lru_cache(maxsize=1)
+def _doubled_table() -> NDArray[np.float32]:
+    return np.repeat(_kernel_table(), 2, axis=1)
+
+
 @lru_cache(maxsize=64)
 def _kernel_inverse(half: int, size: int) -> NDArray[np.float32]:
     """Reciprocal of the kernel's Fourier transform at bins -half … +half of a transform of `size`."""
@@ -216,10 +222,27 @@ def _cut_wedge(
             out[ov, du % out_cols] = spectrum[v, (centre[1] + du) % cols] * (factor * w)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True)
+def _span(slope: float, start: float, low: float, high: float, n: int) -> tuple[int, int]:  # pragma: no cover
+    """Return from where to where, of 0 … n - 1, low <= slope i + start <= high."""
+    first, last = 0, n
+    if slope != 0.0:
+        a, b = (low - start) / slope, (high - start) / slope
+        first = int(min(max(math.floor(min(a, b)) - 1.0, 0.0), float(n)))
+        last = int(min(max(math.ceil(max(a, b)) + 2.0, 0.0), float(n)))
+    # Rounding decides at the ends only: there the inequality itself is asked.
+    while first < last and not low <= slope * first + start <= high:
+        first += 1
+    while last > first and not low <= slope * (last - 1) + start <= high:
+        last -= 1
+    return first, last
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _resample(
     box: NDArray[np.float32],
     table: NDArray[np.float32],
+    doubled: NDArray[np.float32],
     affine: NDArray[np.float64],
     limits: NDArray[np.float64],
     out: NDArray[np.float32],
@@ -227,47 +250,27 @@ def _resample(
     """Interpolate an image at an affine lattice; NaN outside `limits`.
 
     `box` is (rows, cols, 2) float32, extended by `_BORDER` samples of its period on every side;
-    `affine` maps (u, v) to its samples; `out` is (n_v, n_u, 2) float32.
+    `affine` maps (u, v) to its samples; `doubled` is `table` with every weight twice; `out` is
+    (n_v, n_u, 2) float32.
     """
     n_v, n_u = out.shape[:2]
-    nan = np.float32(np.nan)
-    entries = np.float32(table.shape[0] - 1)
-    cols = box.shape[1]
-    stride = np.uintp(2 * cols)
-    flat, weights = box.ravel(), table.ravel()
+    stride = 2 * box.shape[1]
+    samples, down, across, pixels = box.ravel(), table.ravel(), doubled.ravel(), out.ravel()
     for v in range(n_v):
         x0 = affine[0, 1] * v + affine[0, 2]
         y0 = affine[1, 1] * v + affine[1, 2]
-        for u in range(n_u):
+        a, b = _span(affine[0, 0], x0, limits[0], limits[1], n_u)
+        c, d = _span(affine[1, 0], y0, limits[2], limits[3], n_u)
+        first, last = max(a, c), max(min(b, d), max(a, c))
+        out[v, :first] = np.float32(np.nan)
+        out[v, last:] = np.float32(np.nan)
+        for u in range(first, last):
             x = affine[0, 0] * u + x0
             y = affine[1, 0] * u + y0
-            if x < limits[0] or x > limits[1] or y < limits[2] or y > limits[3]:
-                out[v, u, 0] = nan
-                out[v, u, 1] = nan
-                continue
             ix, iy = int(x), int(y)  # not negative: the border is in front
-            # Flat, unsigned indices: the compiler then leaves out the checks for negative ones.
-            wx = np.uintp(int(np.float32(x - ix) * entries + np.float32(0.5)) * 4)
-            wy = np.uintp(int(np.float32(y - iy) * entries + np.float32(0.5)) * 4)
-            w0, w1, w2, w3 = weights[wx], weights[wx + 1], weights[wx + 2], weights[wx + 3]
-            first = np.uintp(((iy - 1) * cols + ix - 1) * 2)
-            # Along y first, eight neighbouring numbers at once: the compiler makes one vector of them.
-            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = np.float32(0.0)
-            for j in range(np.uintp(4)):
-                w = weights[wy + j]
-                a0 += w * flat[first]
-                a1 += w * flat[first + np.uintp(1)]
-                a2 += w * flat[first + np.uintp(2)]
-                a3 += w * flat[first + np.uintp(3)]
-                a4 += w * flat[first + np.uintp(4)]
-                a5 += w * flat[first + np.uintp(5)]
-                a6 += w * flat[first + np.uintp(6)]
-                a7 += w * flat[first + np.uintp(7)]
-                first += stride
-            re = w0 * a0 + w1 * a2 + w2 * a4 + w3 * a6
-            im = w0 * a1 + w1 * a3 + w2 * a5 + w3 * a7
-            out[v, u, 0] = re
-            out[v, u, 1] = im
+            wx, wy = int((x - ix) * _TABLE + 0.5), int((y - iy) * _TABLE + 0.5)
+            at = (iy - 1) * stride + 2 * (ix - 1)
+            interpolate_4x4(samples, at, stride, across, 8 * wx, down, 4 * wy, pixels, 2 * (v * n_u + u))
 
 
 def _extended(box: NDArray[np.complex64]) -> NDArray[np.complex64]:
@@ -461,6 +464,7 @@ class SubApertures:
         _resample(
             extended.view(np.float32).reshape(*extended.shape, 2),
             _kernel_table(),
+            _doubled_table(),
             affine,
             limits,
             pixels.view(np.float32).reshape(*pixels.shape, 2),

@@ -109,7 +109,8 @@ def main() -> int:
     for line in sys.stdin:
         request = json.loads(line)
         try:
-            answer: dict[str, int | str] = {"pid": fork(request["node"], request["arguments"], request["log"], answers.fileno())}
+            pid = fork(request["node"], request["arguments"], request["log"], answers.fileno())
+            answer: dict[str, int | str] = {"pid": pid}
         except Exception as error:
             answer = {"error": f"{type(error).__name__}: {error}"}
         answers.write(json.dumps(answer) + "\n")

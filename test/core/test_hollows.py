@@ -82,7 +82,8 @@ def look_at(body, info, silent=None):
     mean[v[seen & answers], u[seen & answers]] = 1.0
     coarse = rng.exponential(size=tuple(n // 2 + 1 for n in camera.shape)).repeat(2, 0).repeat(2, 1)
     power = (mean * coarse[: camera.shape[0], : camera.shape[1]]).astype(np.float32)
-    return EchoLook.of(Levels(1.0, 4.0, 0.1, True, LocalMeans(power, np.ones(camera.shape, bool))), info, VOLUME)
+    levels = Levels(1.0, 4.0, 0.1, True, LocalMeans(power, np.ones(camera.shape, bool)))
+    return EchoLook.of(levels, info, VOLUME)
 
 
 @pytest.fixture(scope="module")
