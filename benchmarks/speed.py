@@ -377,7 +377,7 @@ def in_fresh_process(code: str, bag: Path) -> dict[str, float]:
     peak = 0
     while process.poll() is None:
         peak = max(peak, sum(map(proportional_kib, descendants(process.pid))))
-        time.sleep(0.2)
+        time.sleep(1.0)
     out = process.communicate()[0]
     if process.returncode:
         raise RuntimeError(f"a benchmark's process ended with status {process.returncode}; expected 0")
