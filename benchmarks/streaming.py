@@ -36,7 +36,8 @@ from csas_shadow_ros.core.parameters import (
 )
 from csas_shadow_ros.core.streaming import Stream
 from csas_shadow_ros.core.target import Target
-from csas_shadow_ros.replay import Graph, _Watcher, free_domain_id, node_parameters
+from csas_shadow_ros.graph import Graph, free_domain_id
+from csas_shadow_ros.replay import _Watcher, node_parameters
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.sectors import sectors_of_run
 

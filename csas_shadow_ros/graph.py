@@ -7,6 +7,7 @@ import ctypes
 import json
 import os
 import random
+import shutil
 import signal
 import socket
 import subprocess
@@ -37,6 +38,9 @@ _START_ORDER = (
 )
 #: Each process has its own numerical libraries: as many threads in each as there are cores would only wait.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+#: With less shared memory than the segments of a graph may come to fill, a write into them is a bus error:
+#: then the middleware's own, smaller ones do, more slowly.
+_SHARED_MEMORY = 1 << 30
 #: Views are a few MB: by default glibc gives such memory back at once, and a quarter of the nodes' time went
 #: into getting it again, page by page.
 _MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(1 << 26), "MALLOC_TRIM_THRESHOLD_": str(1 << 28)}
@@ -83,17 +87,25 @@ def free_domain_id() -> int:
     raise ReplayError("every ROS domain from 1 to 101 is in use on this machine")
 
 
+def free_shared_memory() -> int:
+    """Return how many bytes are free for shared memory: a container often has 64 MB of it."""
+    try:
+        return shutil.disk_usage("/dev/shm").free
+    except OSError:
+        return 0
+
+
 def graph_environment(domain_id: int, log_dir: Path) -> dict[str, str]:
     """Return the environment of the graph's processes: this machine alone, shared memory, few threads."""
-    profile = str(config_file("fastdds_shm.xml"))
     own = {
         "ROS_DOMAIN_ID": str(domain_id),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "FASTRTPS_DEFAULT_PROFILES_FILE": profile,
-        "FASTDDS_DEFAULT_PROFILES_FILE": profile,
         "ROS_LOG_DIR": str(log_dir),
         "CSAS_PARENT_PID": str(os.getpid()),
     }
+    if free_shared_memory() >= _SHARED_MEMORY:
+        profile = str(config_file("fastdds_shm.xml"))
+        own |= {"FASTRTPS_DEFAULT_PROFILES_FILE": profile, "FASTDDS_DEFAULT_PROFILES_FILE": profile}
     own.setdefault("AMENT_PREFIX_PATH", os.environ.get("AMENT_PREFIX_PATH", sys.prefix))
     root = str(Path(__file__).resolve().parents[1])
     path = os.environ.get("PYTHONPATH", "")
@@ -189,7 +201,7 @@ class ForkServer:
         self._asked: deque[Future[int]] = deque()
         with log.open("ab") as output:
             self._server = subprocess.Popen(
-                [sys.executable, "-m", f"{PACKAGE}.nodes.fork_server"],
+                [sys.executable, "-m", f"{PACKAGE}.nodes.fork_server", *_START_ORDER[:2]],
                 env=dict(environment),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
@@ -243,9 +255,14 @@ class ForkServer:
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    def refuse(self) -> None:
+        """Begin with no request any more: those that wait fail."""
+        if self._server.poll() is None:
+            self._server.terminate()
+
     def close(self) -> None:
         """End the server; requests that it has not begun with fail, the processes that it made run on."""
-        self._server.terminate()
+        self.refuse()
         with self._lock, contextlib.suppress(OSError):
             self._server.stdin.close()  # type: ignore[union-attr]
         try:
@@ -439,6 +456,7 @@ class Graph:
         self.environment = graph_environment(domain_id, log_dir)
         file = log_dir / "parameters.yaml"
         file.write_text(yaml_text(parameters, only_given=True), encoding="utf-8")
+        self._server = server
         has_own = {name for name, own in parameters.items() if own}
         self.processes = {
             name: GraphProcess(name, self.environment, log_dir, file if name in has_own else None, server)
@@ -485,6 +503,8 @@ class Graph:
 
     def stop(self) -> None:
         """End all processes: asked first, so that a recorder finishes its bag, then killed."""
+        if self._server is not None:
+            self._server.refuse()
         for process in self.processes.values():
             process.signal(signal.SIGINT)
         for name, process in self.processes.items():

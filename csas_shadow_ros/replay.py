@@ -343,7 +343,6 @@ def replay(
 def _plan(bag: str | Path, stage: str, p: PipelineParameters) -> tuple[str, Target | None]:
     """Say what is played, and where the target is if no node can find it."""
     from .bags import BagReader, read_run
-    from .core.stages import target_of_views
     from .nodes.playing import stage_of_bag
 
     reader = BagReader(bag)
@@ -354,6 +353,8 @@ def _plan(bag: str | Path, stage: str, p: PipelineParameters) -> tuple[str, Targ
     if chosen in ("likelihood", "shadow_mask") and (chosen == "shadow_mask") != hard:
         expected = "hard" if chosen == "shadow_mask" else "one that takes likelihoods (soft)"
         raise ParameterError(f"method is {p.carving.method!r}; expected {expected} for {chosen} views")
+    from .core.stages import target_of_views
+
     run = read_run(bag)
     target = target_of_views(lambda: run.views(chosen), chosen, p.target)
     if target is None:
@@ -426,6 +427,7 @@ def _until_complete(
     source = "sub_aperture" if stage in ("image", "sector") else stage
     sender = "sub_aperture" if stage in ("image", "sector") else "bag_player"
     told = 0
+    loaded = False
     state: object = None
     since = time.monotonic()
     while True:
@@ -440,6 +442,13 @@ def _until_complete(
         beat = watcher.beats.get((sender, source))
         if beat is not None and beat.counts.get("total"):
             progress(beat.counts["done"], beat.counts["total"])
+            if beat.counts["done"] and not loaded:
+                # What the result takes is loaded while the nodes work, not when they have ended.
+                import trimesh  # noqa: F401
+
+                from .core import mesh, target, threshold  # noqa: F401
+
+                loaded = True
         if beat is not None and beat.counts.get("finished") and _sinks_complete(graph, watcher):
             progress(beat.counts["done"], beat.counts["total"])
             return

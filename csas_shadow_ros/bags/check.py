@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.fft
 
 from csas_shadow_ros.core.errors import BagError, CsasError
 from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, Track, View
@@ -481,6 +480,9 @@ def band_energy(image: CoherentImage, grazing_rad: float) -> BandEnergy:
     grazing_rad : float
         Mean grazing angle, which turns frequencies into ground wavenumbers.
     """
+    # Late: a third of a second to import, which whoever only reads bags need not pay.
+    import scipy.fft
+
     rows, cols = (min(n, _MAX_FFT_SIDE) for n in image.grid.shape)
     r, c = (image.grid.rows - rows) // 2, (image.grid.cols - cols) // 2
     tile = image.pixels[r : r + rows, c : c + cols]

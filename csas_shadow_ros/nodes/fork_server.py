@@ -4,14 +4,16 @@ A node alone imports libraries and loads compiled kernels for one to two seconds
 nodes for ten on two cores. Here the first has to, the next have only what is their own left to load, and
 a node that is started again begins to work at once.
 
-Requests come as lines of JSON on standard input: ``{"node": name, "arguments": [...], "log": path}``.
-Each is answered on standard output, in order: ``{"pid": number}``, or ``{"error": text}``. The process ends
-with its input. A node's parent is not this process but the nearest ancestor that takes orphans in
-(``PR_SET_CHILD_SUBREAPER``): its end can be waited for there, and it lives on if this process dies.
+Arguments name nodes to load at once, before anybody asks for them. Requests come as lines of JSON on
+standard input: ``{"node": name, "arguments": [...], "log": path}``. Each is answered on standard output, in
+order: ``{"pid": number}``, or ``{"error": text}``. The process ends with its input; on SIGTERM it refuses
+what it has not begun with. A node's parent is not this process but the nearest ancestor that takes orphans
+in (``PR_SET_CHILD_SUBREAPER``): its end can be waited for there, and it lives on if this process dies.
 """
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import importlib
 import json
@@ -102,13 +104,22 @@ def _become(main: Any, node: str, arguments: list[str], log: str) -> None:
 def main() -> int:
     """Serve requests until there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    told_to_end: list[int] = []
+    # Not in the middle of a request: of a process that was forked the answer must tell.
+    signal.signal(signal.SIGTERM, lambda number, _: told_to_end.append(number))
     # Answers go to what was standard output; whatever a library prints must not come between them.
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.set_inheritable(answers.fileno(), False)
     os.dup2(2, 1)
+    for node in sys.argv[1:]:
+        # What cannot be loaded will be said to who asks for it.
+        with contextlib.suppress(Exception):
+            load(node)
     for line in sys.stdin:
         request = json.loads(line)
         try:
+            if told_to_end:
+                raise RuntimeError("told to end")
             pid = fork(request["node"], request["arguments"], request["log"], answers.fileno())
             answer: dict[str, int | str] = {"pid": pid}
         except Exception as error:

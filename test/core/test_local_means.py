@@ -11,7 +11,6 @@ from csas_shadow_ros.core.local_means import LocalMeans
 
 
 def box_by_box(power: np.ndarray, known: np.ndarray, radius: tuple[int, int]) -> np.ndarray:
-    rows, cols = power.shape
     out = np.full(power.shape, np.inf)
     for v, u in np.argwhere(known):
         box = np.s_[max(0, v - radius[0]) : v + radius[0] + 1, max(0, u - radius[1]) : u + radius[1] + 1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -18,12 +19,14 @@ pytest.importorskip("rclpy")
 
 from graph_of_nodes import PARAMETERS, STEP_DEG
 
+from csas_shadow_ros import graph as graph_module
 from csas_shadow_ros import replay as module
 from csas_shadow_ros.bags import read_run, write_run
 from csas_shadow_ros.core.errors import BagError, NoTargetError, ParameterError, SpectrumSignError
 from csas_shadow_ros.core.parameters import PipelineParameters
 from csas_shadow_ros.core.pipeline import ProcessedView, Result
-from csas_shadow_ros.replay import Graph, ReplayError, free_domain_id, graph_environment, replay
+from csas_shadow_ros.graph import Graph, ReplayError, free_domain_id, graph_environment, start_fork_server
+from csas_shadow_ros.replay import replay
 from csas_shadow_ros.simulation import SimulatedRun
 
 Reference = tuple[Result, list[ProcessedView]]
@@ -218,24 +221,120 @@ def test_a_recorder_that_is_interrupted_finishes_its_bag(tmp_path: Path) -> None
     assert (out / "metadata.yaml").exists()
 
 
-def test_nodes_end_when_the_process_that_started_them_was_killed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("forked", [False, True])
+def test_nodes_end_when_the_process_that_started_them_was_killed(tmp_path: Path, forked: bool) -> None:
     code = (
         "import sys, time; from pathlib import Path\n"
-        "from csas_shadow_ros.replay import Graph, free_domain_id\n"
-        f"g = Graph({{'composites': {{}}}}, free_domain_id(), Path({str(tmp_path)!r}))\n"
-        "g.__enter__(); print(g.processes['composites'].pid, flush=True); time.sleep(600)"
+        "from csas_shadow_ros.graph import Graph, free_domain_id, start_fork_server\n"
+        f"d, log = free_domain_id(), Path({str(tmp_path)!r})\n"
+        f"server = start_fork_server(d, log).__enter__() if {forked} else None\n"
+        "g = Graph({'composites': {}}, d, log, server=server)\n"
+        "g.__enter__(); print(g.processes['composites'].pid, server and server.pid, flush=True)\n"
+        "time.sleep(600)"
     )
     environment = {**os.environ, "PYTHONPATH": str(Path(module.__file__).parents[1])}
     command = [sys.executable, "-c", code]
     parent = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     assert parent.stdout is not None
-    pid = int(parent.stdout.readline())
+    pids = [int(word) for word in parent.stdout.readline().split() if word != "None"]
+    assert len(pids) == 1 + forked
     parent.kill()
     parent.communicate()
     deadline = time.monotonic() + 30
-    while alive(pid):
+    while any(map(alive, pids)):
         assert time.monotonic() < deadline, "the node outlives its parent"
         time.sleep(0.1)
+
+
+def running(graph: Graph, log_dir: Path, node: str) -> None:
+    """Wait until a node's process takes part in the middleware."""
+    deadline = time.monotonic() + 60
+    pid = graph.processes[node].pid
+    while not [f for f in os.listdir(f"/proc/{pid}/task") if _name(pid, f).startswith("dds.")]:
+        assert time.monotonic() < deadline, (log_dir / f"{node}.log").read_text()
+        time.sleep(0.05)
+
+
+def _name(pid: int, task: str) -> str:
+    try:
+        return Path(f"/proc/{pid}/task/{task}/comm").read_text()
+    except OSError:
+        return ""
+
+
+def segments() -> set[str]:
+    """Return the names of the middleware's shared memory."""
+    return {name for name in os.listdir("/dev/shm") if name.startswith(("fastrtps_", "sem.fastrtps_"))}
+
+
+@pytest.mark.parametrize("forked", [False, True])
+def test_processes_that_end_leave_no_shared_memory(tmp_path: Path, forked: bool) -> None:
+    domain, before = free_domain_id(), segments()
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(start_fork_server(domain, tmp_path)) if forked else None
+        nodes: dict[str, dict[str, Any]] = {"composites": {}, "shadow_likelihood": {}}
+        graph = stack.enter_context(Graph(nodes, domain, tmp_path, server=server))
+        for node in graph.processes:
+            running(graph, tmp_path, node)
+        assert segments() - before
+    assert segments() <= before
+
+
+def test_nodes_outlive_the_process_that_forked_them_and_are_started_again_without_it(tmp_path: Path) -> None:
+    domain = free_domain_id()
+    with start_fork_server(domain, tmp_path) as server:
+        assert server is not None
+        with Graph({"composites": {}, "shadow_likelihood": {}}, domain, tmp_path, server=server) as graph:
+            pids = {name: process.pid for name, process in graph.processes.items()}
+            stats = [Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split() for pid in pids.values()]
+            parents = {stat[1] for stat in stats}
+            assert parents == {str(os.getpid())}
+            os.kill(server.pid, signal.SIGKILL)
+            os.kill(pids["composites"], signal.SIGKILL)
+            deadline = time.monotonic() + 30
+            while not graph.deaths:
+                assert time.monotonic() < deadline
+                graph.watch()
+                time.sleep(0.02)
+            assert graph.deaths[0].startswith("composites was killed by signal 9")
+            running(graph, tmp_path, "composites")
+            assert graph.processes["composites"].pid != pids["composites"]
+            assert alive(pids["shadow_likelihood"])
+            assert graph.processes["shadow_likelihood"].poll() is None
+    assert not [pid for pid in pids.values() if alive(pid)]
+
+
+def test_a_graph_that_is_left_before_its_nodes_are_there_leaves_none(tmp_path: Path) -> None:
+    domain = free_domain_id()
+    nodes = ("bag_player", "sub_aperture", "shadow_enhancement", "shadow_likelihood", "voxel_carver")
+    with start_fork_server(domain, tmp_path) as server:
+        assert server is not None
+        with Graph({name: {} for name in nodes}, domain, tmp_path, server=server):
+            pass
+        environment = f"ROS_DOMAIN_ID={domain}\0".encode()
+        left = [
+            path.parent.name
+            for path in Path("/proc").glob("[0-9]*/environ")
+            if readable(path) and environment in path.read_bytes() and path.parent.name != str(server.pid)
+        ]
+        assert not left
+
+
+def readable(path: Path) -> bool:
+    try:
+        path.read_bytes()
+    except OSError:
+        return False
+    return True
+
+
+def test_a_little_shared_memory_is_left_to_the_middleware(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE", raising=False)
+    assert "FASTRTPS_DEFAULT_PROFILES_FILE" in graph_environment(1, tmp_path)
+    monkeypatch.setattr(graph_module, "free_shared_memory", lambda: 64 << 20)
+    assert "FASTRTPS_DEFAULT_PROFILES_FILE" not in graph_environment(1, tmp_path)
 
 
 def test_a_node_that_dies_again_and_again_ends_the_replay_by_name(tmp_path: Path) -> None:
