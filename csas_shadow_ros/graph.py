@@ -271,6 +271,8 @@ class ForkServer:
             self._server.kill()
             self._server.wait()
         self._reader.join()
+        if self._server.stdout is not None:
+            self._server.stdout.close()
         _take_orphans_in(self._before)
 
 

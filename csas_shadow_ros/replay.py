@@ -25,9 +25,9 @@ from .graph import (
     free_domain_id,
     start_fork_server,
 )
-from .nodes.params import NODES
+from .nodes.params import NODES, check
 
-# What takes long to import is imported where it is used: the nodes' processes are on their way meanwhile.
+# What takes long to import is imported where it is used: the nodes' processes are on their way by then.
 if TYPE_CHECKING:
     import trimesh
     from numpy.typing import NDArray
@@ -324,11 +324,11 @@ def replay(
         else:
             out = Path(out_dir)
         recording = None if record is False else out / "recording" if record is True else Path(record)
-        domain = free_domain_id() if domain_id is None else domain_id
-        # First of all: it imports libraries while the bag is looked at.
-        server = stack.enter_context(start_fork_server(domain, out / "log"))
         chosen, target = _plan(bag, stage, p)
         plan = _node_plan(bag, chosen, p, target, rate, recording, composites, window, overrides or {})
+        check(plan)
+        domain = free_domain_id() if domain_id is None else domain_id
+        server = stack.enter_context(start_fork_server(domain, out / "log"))
         graph = stack.enter_context(Graph(plan, domain, out / "log", max_restarts, server))
         watcher = _Watcher(graph, domain)
         stack.callback(watcher.close)
