@@ -196,19 +196,23 @@ class ForkServer:
     """
 
     def __init__(self, environment: Mapping[str, str], log: Path) -> None:
-        self._before = _take_orphans_in(True)
+        _orphans.take_in()
         self._lock = threading.Lock()
         self._asked: deque[Future[int]] = deque()
-        with log.open("ab") as output:
-            self._server = subprocess.Popen(
-                [sys.executable, "-m", f"{PACKAGE}.nodes.fork_server", *_START_ORDER[:2]],
-                env=dict(environment),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=output,
-                text=True,
-                start_new_session=True,
-            )
+        try:
+            with log.open("ab") as output:
+                self._server = subprocess.Popen(
+                    [sys.executable, "-m", f"{PACKAGE}.nodes.fork_server", *_START_ORDER[:2]],
+                    env=dict(environment),
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=output,
+                    text=True,
+                    start_new_session=True,
+                )
+        except BaseException:
+            _orphans.leave()
+            raise
         self._reader = threading.Thread(target=self._read, name="fork server", daemon=True)
         self._reader.start()
 
@@ -273,7 +277,7 @@ class ForkServer:
         self._reader.join()
         if self._server.stdout is not None:
             self._server.stdout.close()
-        _take_orphans_in(self._before)
+        _orphans.leave()
 
 
 def start_fork_server(domain_id: int, log_dir: Path) -> contextlib.AbstractContextManager[ForkServer | None]:
@@ -293,23 +297,50 @@ def start_fork_server(domain_id: int, log_dir: Path) -> contextlib.AbstractConte
         return contextlib.nullcontext()
 
 
-def _take_orphans_in(on: bool) -> bool:
-    """Say whether orphaned descendants shall become this process' children; return whether they did before.
+class _Orphans:
+    """Orphaned descendants become this process' children while somebody wants that."""
 
-    Raises
-    ------
-    ReplayError
-        If the system cannot do that.
-    """
-    set_, get_ = 36, 37  # PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER of Linux
-    before = ctypes.c_int(0)
-    try:
-        prctl = ctypes.CDLL(None, use_errno=True).prctl
-    except (AttributeError, OSError) as error:
-        raise ReplayError(f"no prctl here: {error}") from None
-    if prctl(get_, ctypes.byref(before), 0, 0, 0) or prctl(set_, int(on), 0, 0, 0):
-        raise ReplayError(f"prctl: {os.strerror(ctypes.get_errno())}")
-    return bool(before.value)
+    _SET, _GET = 36, 37  # PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER of Linux
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._wanted = 0
+        self._before = 0
+
+    def take_in(self) -> None:
+        """Want it.
+
+        Raises
+        ------
+        ReplayError
+            If the system cannot do that.
+        """
+        with self._lock:
+            if not self._wanted:
+                before = ctypes.c_int(0)
+                self._call(self._GET, ctypes.byref(before))
+                self._call(self._SET, 1)
+                self._before = before.value
+            self._wanted += 1
+
+    def leave(self) -> None:
+        """Want it no more; for the last one all is as it was before."""
+        with self._lock:
+            self._wanted -= 1
+            if not self._wanted:
+                self._call(self._SET, self._before)
+
+    @staticmethod
+    def _call(option: int, value: Any) -> None:
+        try:
+            prctl = ctypes.CDLL(None, use_errno=True).prctl
+        except (AttributeError, OSError) as error:
+            raise ReplayError(f"no prctl here: {error}") from None
+        if prctl(option, value, 0, 0, 0):
+            raise ReplayError(f"prctl: {os.strerror(ctypes.get_errno())}")
+
+
+_orphans = _Orphans()
 
 
 class GraphProcess:

@@ -873,9 +873,11 @@ def make_executor(context: Context) -> Executor:
     """
     try:
         from rclpy.experimental.events_executor import EventsExecutor
-    except ImportError:
+
+        return EventsExecutor(context=context)
+    except (ImportError, OSError, ValueError, RuntimeError, AttributeError):
+        # It came to ROS 2 with Jazzy, and wants a standard error with a descriptor, which notebooks lack.
         return SingleThreadedExecutor(context=context)
-    return EventsExecutor(context=context)
 
 
 def spin(node: CsasNode, stop: threading.Event) -> None:
