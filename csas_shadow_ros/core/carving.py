@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import lz4.block
@@ -29,6 +29,7 @@ from .echo import echo_zone, opaque_part
 from .errors import ParameterError, ViewError
 from .geometry import View, ViewInfo
 from .parameters import CarvingParameters
+from .seabed import SeabedSlope, seabed_slope, shadow_end
 from .threads import in_order
 from .threshold import least_views_fraction, thresholded
 from .volume import Volume, VoxelGrid
@@ -453,7 +454,36 @@ class Carver:
         first = self.first_look()
         if self.parameters.method != "consensus" or not first.occupied.any():
             return first
-        return self._second_look(first)
+        slope = self._slope(first)
+        if slope is None or not slope.believed:
+            return replace(self._second_look(first), seabed=slope)
+        over = self._over(slope)
+        first = over.first_look()
+        return replace(over._second_look(first) if first.occupied.any() else first, seabed=slope)
+
+    def _slope(self, first: VoxelGrid) -> SeabedSlope | None:
+        """Fit the seabed's slope to the far ends of all silhouettes."""
+        v = self.volume
+        layers = np.flatnonzero(first.occupied.any(axis=(1, 2)))
+        height = float(v.z_m[layers[-1]]) + v.voxel_size_m / 2.0
+        found = in_order(lambda kept: shadow_end(kept.view()), self._masks.values(), _LOOKERS)
+        ends = [end for _, end in found if end is not None]
+        middle = (float(v.x_m[[0, -1]].mean()), float(v.y_m[[0, -1]].mean()))
+        slope = seabed_slope(ends, middle, height)
+        if slope is not None and slope.believed:
+            lowest = min(slope.applied(kept.info).camera.sonar_m[2] for kept in self._masks.values())
+            if lowest <= v.z_m[-1]:
+                return None
+        return slope
+
+    def _over(self, slope: SeabedSlope) -> Carver:
+        """Carve again from the same masks, over a seabed that slopes."""
+        over = Carver(self.volume, self.parameters, pool=self._pool)
+        for stamp, kept in self._masks.items():
+            over._masks[stamp] = KeptMask(slope.applied(kept.info), kept.packed)
+            over._sums.add_mask(kept.view().pixels, over._masks[stamp].info)
+        over.stamps = set(self.stamps)
+        return over
 
     def first_look(self) -> VoxelGrid:
         """Threshold what has been carved so far, covered pixels unknown: what `grid` starts from."""

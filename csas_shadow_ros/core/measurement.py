@@ -21,7 +21,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
@@ -32,6 +31,7 @@ from .geometry import TWO_PI, View, ViewInfo, cross_range_axis, down_range_axis
 from .likelihood import Levels
 from .local_means import LocalMeans
 from .mesh import Dimensions, measure
+from .seabed import largest_piece
 from .volume import VoxelGrid
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
     SilhouetteSides or None
         None if no shadow was segmented.
     """
-    shadow = _largest_piece(mask.pixels == MASK_SHADOW)
+    shadow = largest_piece(mask.pixels == MASK_SHADOW)
     if shadow is None:
         return None
     info = mask.info
@@ -166,17 +166,6 @@ def levels_of_mask(mask: View) -> Levels:
     known = mask.pixels != MASK_UNKNOWN
     power = (known & (mask.pixels != MASK_SHADOW)).astype(np.float32)
     return Levels(math.nan, _DRAWN_CONTRAST, math.nan, False, LocalMeans(power, np.asarray(known)))
-
-
-def _largest_piece(shadow: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-    x, y, width, height = cv2.boundingRect(shadow.view(np.uint8))
-    if not width:
-        return None
-    box = np.s_[y : y + height, x : x + width]  # most of a view is no shadow
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(shadow[box].view(np.uint8), connectivity=8)
-    piece = np.zeros_like(shadow)
-    piece[box] = labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
-    return piece
 
 
 def _side(

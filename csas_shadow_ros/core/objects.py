@@ -11,7 +11,7 @@ body that reaches into its volume, or nothing once it is looked at sharply. What
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -167,6 +167,8 @@ class FurtherBody:
             mesh = mesh_from_grid(one)
             # Silhouettes are those of the whole body: they measure a piece only where it is all of it.
             sides = self.sides if len(pieces) == 1 else []
+            if grid.seabed is not None:
+                sides = [replace(side, info=grid.seabed.corrected(side.info)) for side in sides]
             target = self.target
             if len(pieces) > 1:
                 volume = one.volume

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -249,6 +249,7 @@ def run(
     lap("views")
     if carvers and result.views_used:
         result.grid, result.other_grid = (carver.grid() for carver in carvers)
+        correct_heights(result)
         if result.grid.occupied.any():
             result.mesh = mesh_from_grid(result.grid)
             result.dimensions = measure_object(result.grid, result.mesh, result.sides)
@@ -259,6 +260,15 @@ def run(
         _add_objects(result, further)
         lap("objects")
     return result
+
+
+def correct_heights(result: Result) -> None:
+    """Give what was kept of the views the sonar's height over the seabed that the grid was carved over."""
+    slope = result.grid.seabed if result.grid is not None else None
+    if slope is not None:
+        result.sides = [replace(side, info=slope.corrected(side.info)) for side in result.sides]
+        looks = result.looks.items()
+        result.looks = {stamp: replace(look, info=slope.corrected(look.info)) for stamp, look in looks}
 
 
 def open_hollows(result: Result) -> None:

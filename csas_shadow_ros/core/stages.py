@@ -20,7 +20,7 @@ from .likelihood import Levels, outside_likelihood, view_levels
 from .measurement import SilhouetteSides, levels_of_mask, measure_object, silhouette_sides
 from .mesh import mesh_from_grid
 from .parameters import PipelineParameters, ShadowParameters, TargetParameters
-from .pipeline import Result, compose, open_hollows
+from .pipeline import Result, compose, correct_heights, open_hollows
 from .segmentation import require_silhouette, segment_shadow
 from .shadow import enhance
 from .target import Search, Target, choose_target, search_views
@@ -234,6 +234,7 @@ def run_views(
     if carvers and result.views_used:
         grids = [carver.grid() for carver in carvers if carver.stamps]
         result.grid, result.other_grid = grids[0], grids[1] if len(grids) > 1 else None
+        correct_heights(result)
         if result.grid.occupied.any():
             result.mesh = mesh_from_grid(result.grid)
             result.dimensions = measure_object(result.grid, result.mesh, result.sides)

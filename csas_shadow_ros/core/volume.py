@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import GeometryError, check_range
+
+if TYPE_CHECKING:
+    from .seabed import SeabedSlope
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,8 @@ class VoxelGrid:
         The object's voxels.
     method : str
         How the voxels were carved.
+    seabed : SeabedSlope, optional
+        How the seabed seems to slope; where that is believed, the grid was carved over it.
     """
 
     volume: Volume
@@ -112,3 +118,4 @@ class VoxelGrid:
     threshold: float
     occupied: NDArray[np.bool_]
     method: str = "consensus"
+    seabed: SeabedSlope | None = None
