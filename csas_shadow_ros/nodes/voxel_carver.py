@@ -134,6 +134,11 @@ class VoxelCarverNode(CsasNode):
         # Until all views are here the first look does: the second goes through all the silhouettes again.
         final = self.growing.final
         grid = self.carver.grid() if final else self.carver.first_look()
+        if final and grid.seabed is not None and grid.seabed.believed:
+            self.get_logger().info(
+                f"the seabed slopes by {math.degrees(grid.seabed.slope_rad):.1f}° against the track's level:"
+                " the sonar's heights were corrected"
+            )
         stamp = max(self.carver.stamps)
         self.object_voxels = int(grid.occupied.sum())
         pairs: dict[str, tuple[Publisher, Publisher, NDArray[Any]]] = {

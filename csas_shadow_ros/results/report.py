@@ -233,6 +233,20 @@ def _levels(
     return {"overall": overall, "by_view": views}
 
 
+def _slope(grid: VoxelGrid | None) -> dict[str, Any] | None:
+    """Say how the seabed slopes against the level of the track, and whether the grid was carved over that."""
+    slope = grid.seabed if grid is not None else None
+    if slope is None:
+        return None
+    gx, gy = slope.gradient
+    return {
+        "slope_deg": math.degrees(slope.slope_rad),
+        "uphill_deg": math.degrees(math.atan2(gy, gx)) % 360.0,
+        "sigma_deg": math.degrees(slope.sigma),
+        "believed": slope.believed,
+    }
+
+
 def _sign(result: Result, context: Context) -> dict[str, Any]:
     override = context.spectrum_sign_override
     if result.sign is None and context.nodes is not None and context.image is not None:
@@ -309,6 +323,7 @@ def build_report(
         "shadow_heights": _shadow_heights(result),
         "target": result.target,
         "grid": _grid(result.grid),
+        "seabed_slope": _slope(result.grid),
         "hollows": _hollows(result, scores),
         "other_method": {"grid": _grid(result.other_grid), "dimensions": _dimensions(other)},
         "truth": truth,
@@ -417,6 +432,12 @@ def summary(report: Mapping[str, Any]) -> str:
         if iou_truth := hollows["iou_truth"]:
             line += f"; without them, IoU against the truth {iou_truth['matter']:.3f}"
         lines.append(line)
+    slope = report.get("seabed_slope")
+    if slope and slope["believed"]:
+        lines.append(
+            f"the seabed slopes by {slope['slope_deg']:.1f}° ± {slope['sigma_deg']:.1f}° against the track's"
+            f" level, up towards {slope['uphill_deg']:.0f}°: the sonar's heights were corrected"
+        )
     grid, views = report["grid"], report["views"]
     if grid:
         threshold = "none" if grid["threshold"] is None else f"{grid['threshold']:.4f}"
