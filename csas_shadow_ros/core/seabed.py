@@ -35,7 +35,7 @@ _HARMONICS = 6
 #: Fewer far ends, or less of a circle, tell no slope.
 _MIN_ENDS, _MIN_ARC_RAD = 24, math.pi
 #: A slope is believed if it is so many standard deviations from none, and steeper than this.
-_SIGMAS, _LEAST_RAD = 4.0, math.radians(0.5)
+_SIGMAS, _LEAST_RAD = 3.0, math.radians(0.5)
 #: No seabed that a circle is swum over is steeper.
 _MOST_RAD = math.radians(10.0)
 #: A slope moves ends in proportion only while it is small: it is fitted so often, each time on the last one.
