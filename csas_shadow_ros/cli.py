@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -772,6 +773,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _entry() -> NoReturn:
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number and signal.getsignal(number) == signal.SIG_DFL:
+            # Not on the spot: processes that were started end too, and nothing half-written stays.
+            signal.signal(number, lambda number, _: sys.exit(128 + number))
     sys.exit(main())
 
 

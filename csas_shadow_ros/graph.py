@@ -15,16 +15,19 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent import futures
 from concurrent.futures import Future
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import IO, Any
 
 from .core.errors import CsasError
 from .nodes.params import check, yaml_text
 
 PACKAGE = "csas_shadow_ros"
+#: The ports of higher domains do not exist.
+MAX_DOMAIN_ID = 232
 #: The first to be started are those that have most to do before there is a view.
 _START_ORDER = (
     "bag_player",
@@ -38,6 +41,9 @@ _START_ORDER = (
 )
 #: Each process has its own numerical libraries: as many threads in each as there are cores would only wait.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+#: A fork server that is told to end gets so long, and one that is asked for a node so long: what it loads may
+#: have to be compiled first.
+_GRACE_S, _PATIENCE_S = 5.0, 120.0
 #: With less shared memory than the segments of a graph may come to fill, a write into them is a bus error:
 #: then the middleware's own, smaller ones do, more slowly.
 _SHARED_MEMORY = 1 << 30
@@ -114,16 +120,45 @@ def graph_environment(domain_id: int, log_dir: Path) -> dict[str, str]:
     return {**defaults, **os.environ, **own}
 
 
+_environment_lock = threading.Lock()
+
+
 @contextlib.contextmanager
 def environment_of(values: Mapping[str, str]) -> Iterator[None]:
-    """Have these variables set for a while."""
-    before = dict(os.environ)
-    os.environ.update(values)
+    """Have these variables set for a while; one thread at a time."""
+    with _environment_lock:
+        before = {name: os.environ.get(name) for name in values}
+        os.environ.update(values)
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    os.environ.pop(name, None)
+                else:
+                    os.environ[name] = value
+
+
+@contextlib.contextmanager
+def signals_deferred() -> Iterator[None]:
+    """Hold back what signals raise: a participant that is half made could not be taken away again."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # no signal is handled here
+        return
+    came: list[int] = []
+    before: dict[int, Callable[[int, FrameType | None], Any]] = {}
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        handler = signal.getsignal(number)
+        if callable(handler):
+            before[number] = handler
+            signal.signal(number, lambda n, _: came.append(n))
     try:
         yield
     finally:
-        os.environ.clear()
-        os.environ.update(before)
+        for n, handler in before.items():
+            signal.signal(n, handler)
+        for n in came:
+            before[n](n, None)
 
 
 class _Forked:
@@ -241,6 +276,8 @@ class ForkServer:
         for line in self._server.stdout:
             answer = json.loads(line)
             with self._lock:
+                if not self._asked:
+                    continue
                 asked = self._asked.popleft()
             if "pid" in answer:
                 asked.set_result(answer["pid"])
@@ -259,25 +296,35 @@ class ForkServer:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def refuse(self) -> None:
-        """Begin with no request any more: those that wait fail."""
+    def kill(self) -> None:
+        """End the server at once, which does not answer."""
+        self._server.kill()
+
+    def end(self) -> None:
+        """End the server: requests that it has not begun with fail, the processes that it made run on."""
         if self._server.poll() is None:
             self._server.terminate()
-
-    def close(self) -> None:
-        """End the server; requests that it has not begun with fail, the processes that it made run on."""
-        self.refuse()
         with self._lock, contextlib.suppress(OSError):
             self._server.stdin.close()  # type: ignore[union-attr]
         try:
-            self._server.wait(20.0)
+            self._server.wait(_GRACE_S)
         except subprocess.TimeoutExpired:
             self._server.kill()
             self._server.wait()
         self._reader.join()
-        if self._server.stdout is not None:
-            self._server.stdout.close()
-        _orphans.leave()
+
+    def close(self) -> None:
+        """End the server, and take in no more orphans."""
+        try:
+            self.end()
+        except BaseException:
+            self._server.kill()
+            self._server.wait()
+            raise
+        finally:
+            if self._server.stdout is not None:
+                self._server.stdout.close()
+            _orphans.leave()
 
 
 def start_fork_server(domain_id: int, log_dir: Path) -> contextlib.AbstractContextManager[ForkServer | None]:
@@ -375,6 +422,7 @@ class GraphProcess:
         self._arguments = ["--ros-args", "--params-file", str(parameter_file)] if parameter_file else []
         self._server = server
         self._coming: Future[int] | None = None
+        self._asked_s = 0.0
         self._process: subprocess.Popen[bytes] | _Forked | None = None
         self._log_file: IO[bytes] | None = None
 
@@ -399,6 +447,7 @@ class GraphProcess:
         if self._server is None:
             self._start_alone()
         else:
+            self._asked_s = time.monotonic()
             self._coming = self._server.start(self.node, self._arguments, self.log)
 
     def _start_alone(self) -> None:
@@ -417,8 +466,18 @@ class GraphProcess:
     def _arrive(self, *, wait: bool, fall_back: bool = True) -> None:
         """Take the process from the server; start it alone if the server could not."""
         coming = self._coming
-        if coming is None or not (wait or coming.done()):
+        if coming is None:
             return
+        if self._server is not None and not coming.done():
+            patience = self._asked_s + _PATIENCE_S - time.monotonic()
+            if wait:
+                futures.wait([coming], max(patience, 0.0))
+                patience = 0.0
+            if not coming.done():
+                if patience <= 0.0:
+                    self._server.kill()  # then the answer is an error, and comes soon
+                if not wait:
+                    return
         self._coming = None
         try:
             self._process = _Forked(coming.result())
@@ -536,10 +595,21 @@ class Graph:
 
     def stop(self) -> None:
         """End all processes: asked first, so that a recorder finishes its bag, then killed."""
-        if self._server is not None:
-            self._server.refuse()
-        for process in self.processes.values():
-            process.signal(signal.SIGINT)
-        for name, process in self.processes.items():
-            process.wait(30.0 if name == "bag_recorder" else 5.0)
-            process.close_log()
+        try:
+            if self._server is not None:
+                self._server.end()
+            for process in self.processes.values():
+                process.signal(signal.SIGINT)
+            for name, process in self.processes.items():
+                process.wait(30.0 if name == "bag_recorder" else 5.0)
+                process.close_log()
+        except BaseException:
+            # Another Ctrl-C: no process is left behind for that, not even as a zombie.
+            if self._server is not None:
+                self._server.kill()
+            for process in self.processes.values():
+                process.signal(signal.SIGKILL)
+            for process in self.processes.values():
+                process.wait(5.0)
+                process.close_log()
+            raise

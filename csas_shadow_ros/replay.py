@@ -19,10 +19,12 @@ from .core import errors
 from .core.errors import CsasError, NoTargetError, ParameterError
 from .core.parameters import PipelineParameters
 from .graph import (
+    MAX_DOMAIN_ID,
     Graph,
     ReplayError,
     environment_of,
     free_domain_id,
+    signals_deferred,
     start_fork_server,
 )
 from .nodes.params import NODES, check
@@ -143,22 +145,27 @@ class _Watcher:
         # Late, so that reading this module needs no ROS.
         import rclpy
         from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
 
         from msg_adapters import RclpyMessages
 
         from .nodes import qos
-        from .nodes.base import make_executor
 
         self._qos = qos
         self._rclpy = rclpy
         self._messages = RclpyMessages()
         self._context = Context()
         own = {k: v for k, v in graph.environment.items() if k.startswith(("ROS_", "FAST"))}
-        with environment_of(own):
-            rclpy.init(context=self._context, domain_id=domain_id)
-            self._node = rclpy.create_node("replay", context=self._context, namespace="csas")
-        self._executor = make_executor(self._context)
-        self._executor.add_node(self._node)
+        try:
+            with environment_of(own):
+                rclpy.init(context=self._context, domain_id=domain_id)
+                self._node = rclpy.create_node("replay", context=self._context, namespace="csas")
+            # Not the one that nodes have: there a Ctrl-C that falls into a message becomes another error.
+            self._executor = SingleThreadedExecutor(context=self._context)
+            self._executor.add_node(self._node)
+        except BaseException:
+            rclpy.try_shutdown(context=self._context)
+            raise
         self.beats: dict[tuple[str, str], Any] = {}
         self._dead: set[str] = set()
         self.rejected: dict[tuple[int, str], RejectedView] = {}
@@ -316,6 +323,8 @@ def replay(
         does not get to its end (`ReplayError`).
     """
     p = parameters or PipelineParameters()
+    if domain_id is not None and (type(domain_id) is not int or not 0 <= domain_id <= MAX_DOMAIN_ID):
+        raise ParameterError(f"domain_id is {domain_id!r}; expected a whole number from 0 to {MAX_DOMAIN_ID}")
     tell = notice or (lambda _: None)
     began = time.monotonic()
     with contextlib.ExitStack() as stack:
@@ -330,8 +339,9 @@ def replay(
         domain = free_domain_id() if domain_id is None else domain_id
         server = stack.enter_context(start_fork_server(domain, out / "log"))
         graph = stack.enter_context(Graph(plan, domain, out / "log", max_restarts, server))
-        watcher = _Watcher(graph, domain)
-        stack.callback(watcher.close)
+        with signals_deferred():
+            watcher = _Watcher(graph, domain)
+            stack.callback(watcher.close)
         done = stack.enter_context(_shown(progress))
         _until_complete(graph, watcher, chosen, done, tell, stall_timeout_s)
         result = _collect(watcher, graph, chosen, p, target)

@@ -343,7 +343,7 @@ class CsasNode(LifecycleNode):
             self.setup()
             self.every(1.0, self._publish_diagnostics)
             self.every(0.2, self._tick)
-        except CsasError as error:
+        except (CsasError, OSError) as error:
             self.error = str(error)
             self.get_logger().error(self.error)
             self._destroy_owned()

@@ -6,9 +6,9 @@ a node that is started again begins to work at once.
 
 Arguments name nodes to load at once, before anybody asks for them. Requests come as lines of JSON on
 standard input: ``{"node": name, "arguments": [...], "log": path}``. Each is answered on standard output, in
-order: ``{"pid": number}``, or ``{"error": text}``. The process ends with its input; on SIGTERM it refuses
-what it has not begun with. A node's parent is not this process but the nearest ancestor that takes orphans
-in (``PR_SET_CHILD_SUBREAPER``): its end can be waited for there, and it lives on if this process dies.
+order: ``{"pid": number}``, or ``{"error": text}``. The process ends with its input, or on SIGTERM. A node's
+parent is not this process but the nearest ancestor that takes orphans in (``PR_SET_CHILD_SUBREAPER``): its
+end can be waited for there, and it lives on if this process dies.
 """
 
 from __future__ import annotations
@@ -42,17 +42,18 @@ def load(node: str) -> Any:
     return module.main
 
 
-def fork(node: str, arguments: list[str], log: str, answers: int) -> int:
+def fork(main: Any, node: str, arguments: list[str], log: str, answers: int) -> int:
     """Start a node in a process of its own, whose parent is not this one; return its id.
 
     Parameters
     ----------
+    main : callable
+        Runs the node.
     node, arguments, log : str, list of str, str
         As in a request.
     answers : int
         Descriptor that the node must not hold: whoever reads from it waits for its end.
     """
-    main = load(node)
     sys.stdout.flush()
     sys.stderr.flush()
     # What is loaded stays shared: the collector would write into every page of it.
@@ -61,17 +62,23 @@ def fork(node: str, arguments: list[str], log: str, answers: int) -> int:
     reader, writer = os.pipe()
     between = os.fork()
     if between == 0:
-        pid = os.fork()
-        if pid == 0:
-            for descriptor in (reader, writer, answers):
-                os.close(descriptor)
-            _become(main, node, arguments, log)
-        os.write(writer, str(pid).encode())
-        os._exit(0)
+        # Whatever happens, this process ends here: there is one server.
+        try:
+            pid = os.fork()
+            if pid == 0:
+                for descriptor in (reader, writer, answers):
+                    os.close(descriptor)
+                _become(main, node, arguments, log)
+            os.write(writer, str(pid).encode())
+        finally:
+            os._exit(0)
     os.close(writer)
     os.waitpid(between, 0)
     with open(reader, "rb") as pipe:
-        return int(pipe.read())
+        told = pipe.read()
+    if not told:
+        raise RuntimeError("no further process could be made")
+    return int(told)
 
 
 def _become(main: Any, node: str, arguments: list[str], log: str) -> None:
@@ -104,9 +111,17 @@ def _become(main: Any, node: str, arguments: list[str], log: str) -> None:
 def main() -> int:
     """Serve requests until there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    told_to_end: list[int] = []
-    # Not in the middle of a request: of a process that was forked the answer must tell.
-    signal.signal(signal.SIGTERM, lambda number, _: told_to_end.append(number))
+    forking = told_to_end = False
+
+    def end(*_: object) -> None:
+        nonlocal told_to_end
+        told_to_end = True
+        if not forking:
+            os._exit(0)  # while it loads, or waits
+        # Otherwise not before the answer has told of the process that is being forked.
+
+    signal.signal(signal.SIGTERM, end)
+    parent = os.environ.get("CSAS_PARENT_PID")
     # Answers go to what was standard output; whatever a library prints must not come between them.
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.set_inheritable(answers.fileno(), False)
@@ -116,15 +131,20 @@ def main() -> int:
         with contextlib.suppress(Exception):
             load(node)
     for line in sys.stdin:
+        if parent and os.getppid() != int(parent):
+            break  # whoever asked is gone
         request = json.loads(line)
         try:
-            if told_to_end:
-                raise RuntimeError("told to end")
-            pid = fork(request["node"], request["arguments"], request["log"], answers.fileno())
+            main_of_node = load(request["node"])
+            forking = True
+            pid = fork(main_of_node, request["node"], request["arguments"], request["log"], answers.fileno())
             answer: dict[str, int | str] = {"pid": pid}
         except Exception as error:
             answer = {"error": f"{type(error).__name__}: {error}"}
         answers.write(json.dumps(answer) + "\n")
+        forking = False
+        if told_to_end:
+            break
     return 0
 
 

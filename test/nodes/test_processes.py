@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -25,7 +26,14 @@ from csas_shadow_ros.bags import read_run, write_run
 from csas_shadow_ros.core.errors import BagError, NoTargetError, ParameterError, SpectrumSignError
 from csas_shadow_ros.core.parameters import PipelineParameters
 from csas_shadow_ros.core.pipeline import ProcessedView, Result
-from csas_shadow_ros.graph import Graph, ReplayError, free_domain_id, graph_environment, start_fork_server
+from csas_shadow_ros.graph import (
+    Graph,
+    GraphProcess,
+    ReplayError,
+    free_domain_id,
+    graph_environment,
+    start_fork_server,
+)
 from csas_shadow_ros.replay import replay
 from csas_shadow_ros.simulation import SimulatedRun
 
@@ -318,6 +326,103 @@ def test_a_graph_that_is_left_before_its_nodes_are_there_leaves_none(tmp_path: P
             if readable(path) and environment in path.read_bytes() and path.parent.name != str(server.pid)
         ]
         assert not left
+
+
+def test_a_fork_server_that_does_not_answer_holds_nobody_up(tmp_path: Path) -> None:
+    domain = free_domain_id()
+    with start_fork_server(domain, tmp_path) as server:
+        assert server is not None
+        os.kill(server.pid, signal.SIGSTOP)
+        began = time.monotonic()
+        with Graph({"composites": {}, "shadow_likelihood": {}}, domain, tmp_path, server=server) as graph:
+            assert graph.processes["composites"].poll() is None
+        assert time.monotonic() - began < 20.0
+        assert not alive(server.pid)
+
+
+def test_a_node_is_started_without_a_fork_server_that_takes_too_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(graph_module, "_PATIENCE_S", 0.5)
+    domain = free_domain_id()
+    with start_fork_server(domain, tmp_path) as server:
+        assert server is not None
+        os.kill(server.pid, signal.SIGSTOP)
+        with Graph({"composites": {}}, domain, tmp_path, server=server) as graph:
+            running(graph, tmp_path, "composites")
+            assert graph.processes["composites"].poll() is None
+
+
+def test_an_interrupt_while_processes_are_ended_leaves_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    domain = free_domain_id()
+    pids: list[int] = []
+    waited = GraphProcess.wait
+    calls: list[str] = []
+
+    def interrupted(self: GraphProcess, timeout_s: float) -> None:
+        calls.append(self.node)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        waited(self, timeout_s)
+
+    with start_fork_server(domain, tmp_path) as server:
+        graph = Graph({"composites": {}, "shadow_likelihood": {}}, domain, tmp_path, server=server)
+        with graph:
+            pids = [process.pid for process in graph.processes.values()]
+            monkeypatch.setattr(GraphProcess, "wait", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                graph.stop()
+    assert len(pids) == 2
+    assert not [pid for pid in pids if Path(f"/proc/{pid}").exists()], "not even a zombie"
+
+
+def test_a_terminated_replay_leaves_no_process_and_no_shared_memory(run_bag: Path, tmp_path: Path) -> None:
+    before = segments()
+    environment = {**os.environ, "PYTHONPATH": str(Path(module.__file__).parents[1])}
+    out = str(tmp_path / "out")
+    command = [sys.executable, "-m", "csas_shadow_ros.cli", "replay", str(run_bag), "--out", out]
+    cli = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while len(segments() - before) < 8:
+        assert time.monotonic() < deadline
+        assert cli.poll() is None
+        time.sleep(0.02)
+    children = Path(f"/proc/{cli.pid}/task/{cli.pid}/children").read_text().split()
+    assert children
+    cli.terminate()
+    assert cli.wait(30) == 128 + signal.SIGTERM
+    assert not [pid for pid in children if alive(int(pid))]
+    assert segments() <= before
+    assert not list(tmp_path.glob("*incomplete*"))
+
+
+@pytest.mark.parametrize("domain_id", [-1, 233, "7", True, 1.0])
+def test_a_domain_that_does_not_exist_is_refused(run_bag: Path, domain_id: Any) -> None:
+    with pytest.raises(ParameterError, match=r"domain_id is .*; expected a whole number from 0 to 232"):
+        replay(run_bag, parameters=PARAMETERS, domain_id=domain_id, progress=False)
+
+
+def test_variables_are_put_back_whoever_else_sets_some(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CSAS_TEST_KEPT", "before")
+    monkeypatch.delenv("CSAS_TEST_NEW", raising=False)
+    inside, leave = threading.Event(), threading.Event()
+
+    def other() -> None:
+        with graph_module.environment_of({"CSAS_TEST_KEPT": "other", "CSAS_TEST_NEW": "other"}):
+            inside.set()
+            leave.wait(10)
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    inside.wait(10)
+    threading.Timer(0.2, leave.set).start()
+    with graph_module.environment_of({"CSAS_TEST_KEPT": "mine", "CSAS_TEST_NEW": "mine"}):
+        assert os.environ["CSAS_TEST_NEW"] == "mine"
+    thread.join()
+    assert os.environ["CSAS_TEST_KEPT"] == "before"
+    assert "CSAS_TEST_NEW" not in os.environ
 
 
 def readable(path: Path) -> bool:
