@@ -218,8 +218,10 @@ class _Watcher:
 
     def spin(self, seconds: float) -> None:
         end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            self._executor.spin_once(timeout_sec=left)
+        # What a signal raises in the middle of a callback would leave the middleware half undone.
+        with signals_deferred():
+            while (left := end - time.monotonic()) > 0:
+                self._executor.spin_once(timeout_sec=left)
 
     def collect(self, topics: tuple[str, ...], timeout_s: float) -> dict[str, Any]:
         """Return the last message of latched topics: whoever subscribes now gets the final ones."""
@@ -227,7 +229,7 @@ class _Watcher:
             self._subscribe(topic, self._qos.LATCHED, partial(self.latest.__setitem__, topic))
         end = time.monotonic() + timeout_s
         while not set(topics) <= set(self.latest) and time.monotonic() < end:
-            self._executor.spin_once(timeout_sec=0.1)
+            self.spin(0.05)
         return self.latest
 
     def close(self) -> None:

@@ -450,9 +450,9 @@ class Background:
     """
 
     def __init__(self, node: CsasNode, callback: Callable[[], None]) -> None:
-        self._node = node
-        self._callback = callback
-        self._triggered = self._queued = self._cancelled = False
+        self._node: CsasNode | None = node
+        self._callback: Callable[[], None] | None = callback
+        self._triggered = self._queued = False
 
     def trigger(self) -> None:
         """Do a piece of it soon; asked for several times before that, it is done once."""
@@ -461,18 +461,18 @@ class Background:
 
     def start(self) -> None:
         """Hand it to the executor, if it was triggered and there is one."""
-        executor = self._node.executor
+        executor = self._node.executor if self._node is not None else None
         if self._triggered and not self._queued and executor is not None:
             self._queued = True
             executor.create_task(self._run)
 
     def cancel(self) -> None:
-        """Do no more of it."""
-        self._cancelled = True
+        """Do no more of it; an executor that still has it must not keep the node."""
+        self._node = self._callback = None
 
     def _run(self) -> None:
         self._triggered = self._queued = False
-        if not self._cancelled:
+        if self._node is not None and self._callback is not None:
             self._node.guard("work", self._callback)
 
 
