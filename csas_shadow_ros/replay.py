@@ -439,7 +439,6 @@ def _until_complete(
     source = "sub_aperture" if stage in ("image", "sector") else stage
     sender = "sub_aperture" if stage in ("image", "sector") else "bag_player"
     told = 0
-    loaded = False
     state: object = None
     since = time.monotonic()
     while True:
@@ -454,13 +453,11 @@ def _until_complete(
         beat = watcher.beats.get((sender, source))
         if beat is not None and beat.counts.get("total"):
             progress(beat.counts["done"], beat.counts["total"])
-            if beat.counts["done"] and not loaded:
+            if beat.counts["done"]:
                 # What the result takes is loaded while the nodes work, not when they have ended.
                 import trimesh  # noqa: F401
 
                 from .core import mesh, target, threshold  # noqa: F401
-
-                loaded = True
         if beat is not None and beat.counts.get("finished") and _sinks_complete(graph, watcher):
             progress(beat.counts["done"], beat.counts["total"])
             return

@@ -468,8 +468,7 @@ class Carver:
         height = float(v.z_m[layers[-1]]) + v.voxel_size_m / 2.0
         found = in_order(lambda kept: shadow_end(kept.view()), self._masks.values(), _LOOKERS)
         ends = [end for _, end in found if end is not None]
-        middle = (float(v.x_m[[0, -1]].mean()), float(v.y_m[[0, -1]].mean()))
-        slope = seabed_slope(ends, middle, height)
+        slope = seabed_slope(ends, v.centre_m[:2], height)
         if slope is not None and slope.believed:
             lowest = min(slope.applied(kept.info).camera.sonar_m[2] for kept in self._masks.values())
             if lowest <= v.z_m[-1]:
