@@ -10,8 +10,10 @@ edge's mean place is the mean of h over the aperture,
 and beside a flat side seen along it, lies outside of it. A plan is convex to its shadows: h + h'' ≥ 0. The
 least-squares h under that condition undoes the mean over the aperture.
 
-The height comes from the carved layers. Shadows cannot tell a flat top from one that rises towards the middle
-at up to the grazing angle, and carving leaves that cap: the height is where the cap begins.
+The height of a target with upright walls comes from the length of its shadows, which then agree from view to
+view. Otherwise it comes from the carved layers. Shadows cannot tell a flat top from one that rises towards the
+middle at up to the grazing angle, and carving leaves that cap: the height is half-way between a flat top's,
+where the cap begins, and a dome's.
 """
 
 from __future__ import annotations
@@ -52,8 +54,12 @@ _BULGE_PX = 0.8
 _BULGE_WITHIN = 0.8
 #: Fewer rows than this give no edge.
 _MIN_ROWS = 8
-#: What a side of a silhouette may be: as far out at every range, drawn in upwards, or out in its middle.
-SHAPES = ("straight", "tapering", "round")
+#: What a side of a silhouette may be: as far out at every range, drawn in upwards, out in its middle, or
+#: straight above a foot that stands out.
+SHAPES = ("straight", "tapering", "round", "flared")
+_STRAIGHT, _FLARED = SHAPES.index("straight"), SHAPES.index("flared")
+#: A foot is so many rows long, and stands out if the views beside agree on more than this (pixels).
+_FOOT_ROWS, _FLARE_PX = 24, 1.0
 #: Directions that a plan's sides may face, and looks over an aperture.
 _DIRECTIONS, _LOOKS = 120, 9
 #: A side that holds this share of the outline gets finer directions round it: so many, so far apart (rad).
@@ -78,6 +84,14 @@ _RESAMPLINGS = 20
 _EDGE_CELLS = 0.6
 #: Where the cap begins: the mean of these two, voxels under the cap's top.
 _CAP_SLACK = (0.2, 0.3)
+#: How gradually it begins tells a dome: between these two, voxels under the cap's top.
+_DOME_SLACK = (0.5, 2.0)
+#: Walls are upright if more than this share of the views tell one height, to its error, and that height is
+#: within so many voxels of where the cap begins.
+_AGREE, _UPRIGHT_VOXELS = 0.5, 2.0
+#: The height that upright walls tell: this percentile of the views, the middle of their higher half (a view
+#: that sees something else narrower at its top tells too little).
+_UPRIGHT_PERCENTILE = 75.0
 _SIGMAS_95 = 1.96
 #: A drawn silhouette has no levels of its own.
 _DRAWN_CONTRAST = 1e3
@@ -99,7 +113,8 @@ class SilhouetteSides:
     tip_m : float
         Down-range e_r · p of the shadow's far end, m.
     shapes : tuple of str
-        Which of `SHAPES` each side seems to be in this view alone; empty where nobody looked.
+        Which of `SHAPES` each side seems to be in this view alone (never flared, which one view is too rough
+        to tell); empty where nobody looked.
     support_by_shape_m : tuple of tuple of float
         The support of each side if it is of each of `SHAPES`, m; NaN where it cannot be.
     """
@@ -154,7 +169,8 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
         axis = sign * e_c
         directions.append(math.atan2(axis[1], axis[0]))
         here = float(axis @ np.asarray(target_m))
-        supports.append(tuple(out[name] * col_m - outside * (name == "straight") + here for name in SHAPES))
+        beyond = {"straight": outside, "flared": outside}
+        supports.append(tuple(out[name] * col_m - beyond.get(name, 0.0) + here for name in SHAPES))
         shapes.append(shape)
     tip = info.down_range_of_rows()[rows[-1]] + row_m / 2.0
     own = tuple(each[SHAPES.index(shape)] for each, shape in zip(supports, shapes, strict=True))
@@ -196,6 +212,10 @@ def _side(
     for name, curve in curves.items():
         foot = max(0.0, -slope) * hidden if name == "tapering" else 0.0
         out[name] = float(curve.max()) + foot + _edge_beyond(levels, rows, scale, sign * curve, sign, u0)
+    near = rows < rows[0] + _FOOT_ROWS
+    foot_px = np.full(int(near.sum()), float(calm[kept][near].mean()))
+    beyond_foot = _edge_beyond(levels, rows[near], scale[near], sign * foot_px, sign, u0)
+    out["flared"] = float(foot_px[0]) + beyond_foot
     return None if math.isnan(out[shape]) else (out, shape)
 
 
@@ -250,24 +270,35 @@ def _fitted_side(along: FloatArray, out_px: FloatArray) -> tuple[dict[str, Float
 
 
 def _agreed_support(sides: Sequence[SilhouetteSides]) -> FloatArray:
-    """Return the supports of all sides, each taken for the shape that most sides beside it seem to have.
+    """Return the supports of all sides, each taken for the shape that the sides beside it and all sides have.
 
     Speckle roughens edges, so that one view alone is wrong about a side in six, and a straight side that is
-    taken for a round one is measured 2 cm too far out. Views within half an aperture look at the same side.
+    taken for a round one is measured 2 cm too far out. Views within half an aperture look at the same side;
+    what all sides are counts as much as these, as few bodies have walls here and bulges there.
     """
     own = np.array([support for side in sides for support in side.support_m], dtype=np.float64)
     told = [shape for side in sides for shape in side.shapes]
-    if len(told) != len(own):
+    if len(told) != len(own) or not told:
         return own  # of a program that does not tell shapes
     shape = np.array([SHAPES.index(name) for name in told], dtype=np.intp)
     by_shape = np.array([each for side in sides for each in side.support_by_shape_m]).reshape(-1, len(SHAPES))
     phi = np.array([angle for side in sides for angle in side.direction_rad])
     half = np.array([side.info.aperture_rad / 2.0 for side in sides for _ in side.direction_rad])
     beside = np.abs(np.mod(phi[:, None] - phi[None, :] + math.pi, TWO_PI) - math.pi) <= half[:, None] + 1e-9
-    votes = beside.astype(np.float64) @ np.eye(len(SHAPES))[shape]
+    ballots = np.eye(len(SHAPES))[shape]
+    votes = beside.astype(np.float64) @ ballots
+    votes += votes.sum(axis=1, keepdims=True) * ballots.mean(axis=0)
     # What a view alone says breaks a tie.
     votes[np.arange(len(shape)), shape] += 0.5
     agreed = by_shape[np.arange(len(shape)), votes.argmax(axis=1)]
+    straight = np.flatnonzero(votes.argmax(axis=1) == _STRAIGHT)
+    pixel = np.array([side.info.camera.spacing_m[1] for side in sides for _ in side.direction_rad])
+    flare = by_shape[:, _FLARED] - by_shape[:, _STRAIGHT]
+    for index in straight:
+        told_beside = flare[beside[index] & np.isfinite(flare)]
+        stands_out = float(np.median(told_beside)) if len(told_beside) else 0.0
+        if stands_out > _FLARE_PX * pixel[index]:
+            agreed[index] += stands_out
     return np.where(np.isnan(agreed), own, agreed)
 
 
@@ -413,8 +444,27 @@ def _rectangle(support: FloatArray, centre: FloatArray) -> _Rectangle:
     )
 
 
-def cap_height(grid: VoxelGrid, grazing_rad: float) -> tuple[float, float]:
-    """Return the height at which the cap begins that shadows leave on any top, and the cap's own top (m).
+@dataclass(frozen=True)
+class Cap:
+    """The top of a carved shape, of which shadows tell only so much.
+
+    Parameters
+    ----------
+    begins_m : float
+        Height (m) at which the cap begins that shadows leave on a flat top: the top, if it is flat.
+    dome_m : float
+        Height (m) of the top, if it is round.
+    top_m : float
+        Height (m) of the cap's own top.
+    """
+
+    begins_m: float
+    dome_m: float
+    top_m: float
+
+
+def cap_of(grid: VoxelGrid, grazing_rad: float) -> Cap:
+    """Find the cap that carving leaves on the top of a shape.
 
     Parameters
     ----------
@@ -422,6 +472,13 @@ def cap_height(grid: VoxelGrid, grazing_rad: float) -> tuple[float, float]:
         Carved grid with an object.
     grazing_rad : float
         ψ: a layer of inscribed radius R carries a cap tan ψ · R high.
+
+    Notes
+    -----
+    The cap that layer z carries reaches z + tan ψ · R(z). Under a flat top that grows by a metre a metre, and
+    stops at the top. A dome of height H and radius of curvature r has R² = 2 r (H - z), the cap's top lies at
+    H + t with t = r tan² ψ / 2, and a layer whose cap ends s lower lies at z(s) = H - (√t + √s)²: two of
+    these give H.
     """
     d = grid.volume.voxel_size_m
     layers = np.flatnonzero(grid.occupied.any(axis=(1, 2)))
@@ -431,16 +488,52 @@ def cap_height(grid: VoxelGrid, grazing_rad: float) -> tuple[float, float]:
         inside = scipy.ndimage.distance_transform_edt(np.pad(grid.occupied[k], 1))
         reach[n] = faces[n] + math.tan(grazing_rad) * (float(inside.max()) - 0.5) * d
     top = float(reach.max())
-    begins = []
-    for slack in _CAP_SLACK:
-        # The lowest layer from which the cap alone reaches the top, interpolated between layers.
+
+    def lowest(slack: float) -> float:
+        # The lowest layer from which the cap alone reaches so near the top, interpolated between layers.
         limit = top - slack * d
         first = int(np.argmax(reach >= limit))
         below = max(first - 1, 0)
         rise = max(float(reach[first] - reach[below]), 1e-9)
         share = float(np.clip((limit - reach[below]) / rise, 0.0, 1.0))
-        begins.append(float(faces[below] + share * (faces[first] - faces[below])))
-    return float(np.mean(begins)), float(faces[-1])
+        return float(faces[below] + share * (faces[first] - faces[below]))
+
+    begins = float(np.mean([lowest(slack) for slack in _CAP_SLACK]))
+    near, far = (slack * d for slack in _DOME_SLACK)
+    z_near, z_far = (lowest(slack) for slack in _DOME_SLACK)
+    root_t = max(0.0, (z_near - z_far - (far - near)) / (2.0 * (math.sqrt(far) - math.sqrt(near))))
+    dome = z_near + (root_t + math.sqrt(near)) ** 2
+    return Cap(begins, float(np.clip(dome, begins, max(begins, faces[-1]))), float(faces[-1]))
+
+
+def upright_height(
+    sides: Sequence[SilhouetteSides], dimensions: Dimensions, cap: Cap, sigma_m: float, voxel_size_m: float
+) -> float | None:
+    """Return the height (m) of a target with upright walls, None if its walls are not.
+
+    Parameters
+    ----------
+    sides : sequence of SilhouetteSides
+        Of all views.
+    dimensions : Dimensions
+        The target's plan.
+    cap : Cap
+        The carved top.
+    sigma_m : float
+        Standard deviation of the height that one view tells, m.
+    voxel_size_m : float
+        Edge of a voxel.
+
+    Notes
+    -----
+    Behind upright walls each shadow's length tells the height (`shadow_height`); behind others too little,
+    and from each side another.
+    """
+    told = np.array([shadow_height(side, dimensions) for side in sides])
+    height = float(np.percentile(told, _UPRIGHT_PERCENTILE))
+    agree = float(np.mean(np.abs(told - height) <= sigma_m))
+    near = abs(height - cap.begins_m) <= _UPRIGHT_VOXELS * voxel_size_m
+    return height if agree > _AGREE and near else None
 
 
 def shadow_height(side: SilhouetteSides, dimensions: Dimensions) -> float:
@@ -482,8 +575,8 @@ def measure_object(
     -------
     Dimensions
         Length, width, heading and position of the plan, from the silhouettes (from the surface where the
-        aperture is too narrow to smear them by half a voxel and a quarter of a cell); height from the carved
-        layers; volume of the surface. Intervals of length and width come from resampling the views in blocks
+        aperture is too narrow to smear them by half a voxel and a quarter of a cell); height from the
+        shadows' lengths if these agree on one, otherwise from the carved layers; volume of the surface. Intervals of length and width come from resampling the views in blocks
         of an aperture (neighbours share their looks), with the error of an edge (0.6 of a cross-range cell)
         added in quadrature.
 
@@ -498,7 +591,6 @@ def measure_object(
         return whole
     plan = _rectangle(fit.solve(), fit.centre)
     grazing = float(np.median([side.info.camera.grazing_rad for side in sides]))
-    height, cap = cap_height(grid, grazing)
     resampled = _resampled(fit, sides, seed)
     down, across = (float(np.median([s.info.resolution_m[axis] for s in sides])) for axis in (0, 1))
     edge = _EDGE_CELLS * across
@@ -523,22 +615,26 @@ def measure_object(
         plan.heading_rad - _SIGMAS_95 * sigma,
         plan.heading_rad + _SIGMAS_95 * sigma,
     )
-    # The true top lies anywhere in the cap.
-    sigma = math.hypot(d / 2.0, down * math.tan(grazing), max(cap - height, 0.0) / 3.0)
+    cap = cap_of(grid, grazing)
+    sigma = math.hypot(d / 2.0, down * math.tan(grazing))
+    measured = replace(
+        whole,
+        length_m=plan.length_m,
+        width_m=plan.width_m,
+        heading_rad=plan.heading_rad,
+        position_m=plan.position_m,
+        hull_top_m=cap.top_m,
+    )
+    height = upright_height(sides, measured, cap, sigma, d)
+    if height is None:
+        # Flat or round: half-way. The true top lies anywhere in the cap.
+        height = 0.5 * (cap.begins_m + cap.dome_m)
+        sigma = math.hypot(sigma, max(cap.top_m - height, 0.0) / 3.0)
     intervals["height_m"] = (max(0.0, height - _SIGMAS_95 * sigma), height + _SIGMAS_95 * sigma)
     # A surface that lies wrong by one error everywhere.
     change = float(mesh.area) * math.hypot(edge / 2.0, d / 4.0)
     intervals["volume_m3"] = (max(0.0, whole.volume_m3 - change), whole.volume_m3 + change)
-    return replace(
-        whole,
-        length_m=plan.length_m,
-        width_m=plan.width_m,
-        height_m=height,
-        heading_rad=plan.heading_rad,
-        position_m=plan.position_m,
-        hull_top_m=cap,
-        intervals=intervals,
-    )
+    return replace(measured, height_m=height, intervals=intervals)
 
 
 def _resampled(fit: PlanFit, sides: Sequence[SilhouetteSides], seed: int) -> list[_Rectangle]:
@@ -556,11 +652,13 @@ def _resampled(fit: PlanFit, sides: Sequence[SilhouetteSides], seed: int) -> lis
 
 
 __all__ = [
+    "Cap",
     "PlanFit",
     "SilhouetteSides",
-    "cap_height",
+    "cap_of",
     "levels_of_mask",
     "measure_object",
     "shadow_height",
     "silhouette_sides",
+    "upright_height",
 ]

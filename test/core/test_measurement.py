@@ -33,7 +33,7 @@ from csas_shadow_ros.core.measurement import (
     SHAPES,
     PlanFit,
     SilhouetteSides,
-    cap_height,
+    cap_of,
     levels_of_mask,
     measure_object,
     shadow_height,
@@ -139,11 +139,12 @@ def with_shapes(sides, true, wrong, told_wrong):
     out = []
     for n, side in enumerate(sides):
         told = wrong if told_wrong(n) else true
-        by_shape = tuple(
-            tuple(s if name == true else s + 0.03 for name in SHAPES) for s in side.support_m
-        )
+        by_shape = []
+        for s in side.support_m:
+            of = {name: s if name == true else s + 0.03 for name in SHAPES}
+            by_shape.append(tuple((of | {"flared": of["straight"]}).values()))
         own = tuple(each[SHAPES.index(told)] for each in by_shape)
-        out.append(replace(side, support_m=own, shapes=(told, told), support_by_shape_m=by_shape))
+        out.append(replace(side, support_m=own, shapes=(told, told), support_by_shape_m=tuple(by_shape)))
     return out
 
 
@@ -156,6 +157,38 @@ def test_a_view_that_is_alone_in_what_it_takes_a_side_for_is_outvoted(true, wron
     # Where most views say so, they are believed.
     most = with_shapes(exact, true, wrong, lambda n: n % 3 != 0)
     assert widths(PlanFit(most, grid_of(occupied))) == pytest.approx((0.56, 0.36), abs=0.012)
+
+
+def test_what_all_sides_are_counts_as_much_as_the_sides_beside():
+    occupied = hull_of(BOX, INFOS, VOLUME)
+    exact = drawn_sides(box_support(0.5, 0.3))
+
+    def near_x(n):
+        # Both sides of a view that looks along y face along x.
+        return abs(math.sin(exact[n].info.aspect_rad)) > math.cos(math.radians(16.0))
+
+    # A body whose sides are round but for a few that seem straight, more of them than not.
+    few = with_shapes(exact, "round", "straight", lambda n: near_x(n) and n % 3 != 0)
+    assert widths(PlanFit(few, grid_of(occupied))) == pytest.approx((0.5, 0.3), abs=0.006)
+    # All of them seem straight there: so they are.
+    wall = with_shapes(exact, "round", "straight", near_x)
+    assert widths(PlanFit(wall, grid_of(occupied)))[0] > 0.55
+
+
+@pytest.mark.parametrize(("stands_out_px", "counts"), [(3.0, True), (0.6, False)])
+def test_a_foot_that_stands_out_of_a_straight_side_counts_if_the_views_beside_agree(stands_out_px, counts):
+    occupied = hull_of(BOX, INFOS, VOLUME)
+    foot_m = stands_out_px * INFOS[0].camera.spacing_m[1]
+    exact = with_shapes(drawn_sides(box_support(0.4, 0.3)), "straight", "round", lambda n: False)
+    sides = []
+    for n, side in enumerate(exact):
+        by_shape = tuple(
+            (straight, tapering, rounded, straight + foot_m * (n % 4 != 0))
+            for straight, tapering, rounded, _ in side.support_by_shape_m
+        )
+        sides.append(replace(side, support_by_shape_m=by_shape))
+    grows = 2 * foot_m * counts
+    assert widths(PlanFit(sides, grid_of(occupied))) == pytest.approx((0.4 + grows, 0.3 + grows), abs=0.006)
 
 
 def test_the_carved_voxels_stand_in_where_an_arc_is_missing():
@@ -218,9 +251,26 @@ def test_the_height_is_where_the_cap_begins(half_m):
     z, y, x = np.meshgrid(VOLUME.z_m, VOLUME.y_m, VOLUME.x_m, indexing="ij")
     inside = half_m - np.maximum(np.abs(x), np.abs(y))
     occupied = (inside > 0) & (z < 0.2 + math.tan(GRAZING) * np.maximum(inside, 0.0))
-    height, top = cap_height(grid_of(occupied), GRAZING)
-    assert height == pytest.approx(0.2, abs=0.75 * VOLUME.voxel_size_m)
-    assert top > 0.2 + 0.5 * math.tan(GRAZING) * half_m
+    cap = cap_of(grid_of(occupied), GRAZING)
+    assert cap.begins_m == pytest.approx(0.2, abs=0.75 * VOLUME.voxel_size_m)
+    assert cap.top_m > 0.2 + 0.5 * math.tan(GRAZING) * half_m
+
+
+@pytest.mark.parametrize("radius_m", [0.25, 0.4, 0.6])
+@pytest.mark.parametrize("high_m", [0.292, 0.3, 0.307])
+def test_a_dome_is_told_by_how_gradually_its_cap_begins(radius_m, high_m):
+    volume = Volume.around((0.003, -0.006), (1.3, 1.3, 0.45), 0.02)
+    z, y, x = np.meshgrid(volume.z_m, volume.y_m, volume.x_m, indexing="ij")
+    rho, slope = np.hypot(x, y), 0.24
+    # A paraboloid with that radius of curvature; above where it is as steep as the rays, the cap they leave.
+    rest = radius_m * slope**2 / 2
+    top = np.where(rho > radius_m * slope, high_m - rho**2 / (2 * radius_m), high_m + rest - rho * slope)
+    cap = cap_of(grid_of(z < top, volume), math.atan(slope))
+    middle = (cap.begins_m + cap.dome_m) / 2
+    assert cap.begins_m < high_m - 0.5 * rest  # taken for flat it is too low
+    assert cap.begins_m <= cap.dome_m <= cap.top_m
+    assert middle == pytest.approx(high_m, abs=0.6 * volume.voxel_size_m)
+    assert abs(middle - high_m) < abs(cap.begins_m - high_m)
 
 
 def test_a_shadow_s_length_gives_an_upright_box_s_height():
@@ -230,6 +280,33 @@ def test_a_shadow_s_length_gives_an_upright_box_s_height():
     measured = measure_object(grid, mesh_from_grid(grid), sides)
     heights = [shadow_height(side, measured) for side in sides]
     assert np.median(heights) == pytest.approx(0.25, abs=0.012)
+
+
+def test_upright_walls_are_as_high_as_their_shadows_say_whatever_carving_leaves_on_top():
+    occupied = hull_of(BOX, INFOS, VOLUME)
+    sides = sides_of(BOX, tuple(replace(info, aperture_rad=1e-6) for info in INFOS))
+    # Speckle leaves a few layers more: the top layer again, twice.
+    top = int(np.flatnonzero(occupied.any(axis=(1, 2)))[-1])
+    flat = int(np.argmin(np.abs(VOLUME.z_m - 0.25)))
+    occupied[flat : flat + 2] = occupied[flat - 2]
+    assert occupied.any(axis=(1, 2))[top]
+    grid = grid_of(occupied)
+    measured = measure_object(grid, mesh_from_grid(grid), sides)
+    assert cap_of(grid, GRAZING).begins_m > 0.27
+    assert measured.height_m == pytest.approx(0.25, abs=0.008)
+    low, high = measured.intervals["height_m"]
+    assert low < 0.25 < high
+
+
+def test_shadow_lengths_behind_walls_that_are_not_upright_do_not_tell_the_height():
+    occupied = hull_of(hidden_by_cone, INFOS, VOLUME)
+    grid = grid_of(occupied)
+    # An exact round cone has the same shadow from every side: that its views agree is not enough.
+    sides = sides_of(hidden_by_cone, tuple(replace(info, aperture_rad=1e-6) for info in INFOS))
+    measured = measure_object(grid, mesh_from_grid(grid), sides)
+    lengths = np.median([shadow_height(side, measured) for side in sides])
+    assert lengths < 0.26  # its flat top is 0.3 m high
+    assert measured.height_m == pytest.approx(0.3, abs=0.025)
 
 
 # The second look
@@ -370,3 +447,18 @@ def test_a_side_that_is_drawn_in_upwards_is_followed_to_its_foot_that_the_echo_h
     support = np.concatenate([side.support_m for side in sides])
     assert len(support) == 2 * len(INFOS)
     assert np.median(support) == pytest.approx(0.3, abs=0.012)  # a pixel; the foot hides 2.4 cm
+
+
+def hidden_by_flared(x, y, sonar):
+    """A wall with a foot that stands out by 3 cm to either side and is 9 cm high."""
+    wall = hidden_by_box(x, y, sonar, (-0.15, -0.15, 0.0), (0.15, 0.15, 0.35))
+    return wall | hidden_by_box(x, y, sonar, (-0.18, -0.18, 0.0), (0.18, 0.18, 0.09))
+
+
+def test_a_wall_s_foot_is_seen_in_its_first_rows():
+    view = perfect_views(hidden_by_flared, INFOS[:1], "mask")[0]
+    side = silhouette_sides(levels_of_mask(view), view, (0.0, 0.0))
+    for by_shape in side.support_by_shape_m:
+        told = dict(zip(SHAPES, by_shape, strict=True))
+        assert told["flared"] == pytest.approx(0.18, abs=0.012)
+        assert told["straight"] < 0.172
