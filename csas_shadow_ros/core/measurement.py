@@ -86,9 +86,9 @@ _EDGE_CELLS = 0.6
 _CAP_SLACK = (0.2, 0.3)
 #: How gradually it begins tells a dome: between these two, voxels under the cap's top.
 _DOME_SLACK = (0.5, 2.0)
-#: Walls are upright if more than this share of the views tell one height, to its error, and that height is
-#: within so many voxels of where the cap begins.
-_AGREE, _UPRIGHT_VOXELS = 0.5, 2.0
+#: Walls are upright if more than this share of the silhouettes' sides are straight and of the views tell one
+#: height, to its error, which is within so many voxels of where the cap begins.
+_MOST, _UPRIGHT_VOXELS = 0.5, 2.0
 #: The height that upright walls tell: this percentile of the views, the middle of their higher half (a view
 #: that sees something else narrower at its top tells too little).
 _UPRIGHT_PERCENTILE = 75.0
@@ -526,14 +526,17 @@ def upright_height(
 
     Notes
     -----
-    Behind upright walls each shadow's length tells the height (`shadow_height`); behind others too little,
-    and from each side another.
+    Upright walls have straight sides, and behind them each shadow's length tells the height
+    (`shadow_height`); behind others it tells too little, and another height from each side.
     """
+    shapes = [shape == "straight" for side in sides for shape in side.shapes]
+    if not shapes or float(np.mean(shapes)) <= _MOST:
+        return None
     told = np.array([shadow_height(side, dimensions) for side in sides])
     height = float(np.percentile(told, _UPRIGHT_PERCENTILE))
     agree = float(np.mean(np.abs(told - height) <= sigma_m))
     near = abs(height - cap.begins_m) <= _UPRIGHT_VOXELS * voxel_size_m
-    return height if agree > _AGREE and near else None
+    return height if agree > _MOST and near else None
 
 
 def shadow_height(side: SilhouetteSides, dimensions: Dimensions) -> float:

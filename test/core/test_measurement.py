@@ -38,6 +38,7 @@ from csas_shadow_ros.core.measurement import (
     measure_object,
     shadow_height,
     silhouette_sides,
+    upright_height,
 )
 from csas_shadow_ros.core.mesh import mesh_from_grid
 from csas_shadow_ros.core.parameters import CarvingParameters
@@ -296,6 +297,20 @@ def test_upright_walls_are_as_high_as_their_shadows_say_whatever_carving_leaves_
     assert measured.height_m == pytest.approx(0.25, abs=0.008)
     low, high = measured.intervals["height_m"]
     assert low < 0.25 < high
+
+
+def test_views_that_agree_by_chance_tell_no_height_where_sides_are_not_straight():
+    occupied = hull_of(BOX, INFOS, VOLUME)
+    grid = grid_of(occupied)
+    sides = sides_of(BOX, tuple(replace(info, aperture_rad=1e-6) for info in INFOS))
+    measured = measure_object(grid, mesh_from_grid(grid), sides)
+    cap = cap_of(grid, GRAZING)
+    told = upright_height(sides, measured, cap, 0.012, VOLUME.voxel_size_m)
+    assert told == pytest.approx(0.25, abs=0.008)
+    rounded = [replace(side, shapes=("round",) * len(side.shapes)) for side in sides]
+    assert upright_height(rounded, measured, cap, 0.012, VOLUME.voxel_size_m) is None
+    untold = [replace(side, shapes=()) for side in sides]
+    assert upright_height(untold, measured, cap, 0.012, VOLUME.voxel_size_m) is None
 
 
 def test_shadow_lengths_behind_walls_that_are_not_upright_do_not_tell_the_height():
