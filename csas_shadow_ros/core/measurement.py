@@ -11,9 +11,9 @@ and beside a flat side seen along it, lies outside of it. A plan is convex to it
 least-squares h under that condition undoes the mean over the aperture.
 
 The height of a target with upright walls comes from the length of its shadows, which then agree from view to
-view. Otherwise it comes from the carved layers. Shadows cannot tell a flat top from one that rises towards the
-middle at up to the grazing angle, and carving leaves that cap: the height is half-way between a flat top's,
-where the cap begins, and a dome's.
+view. Otherwise it comes from the carved layers. Shadows cannot tell a flat top from one that rises towards
+the middle at up to the grazing angle, and carving leaves that cap: the height is half-way between a flat
+top's, where the cap begins, and a dome's.
 """
 
 from __future__ import annotations
@@ -60,6 +60,8 @@ SHAPES = ("straight", "tapering", "round", "flared")
 _STRAIGHT, _FLARED = SHAPES.index("straight"), SHAPES.index("flared")
 #: A foot is so many rows long, and stands out if the views beside agree on more than this (pixels).
 _FOOT_ROWS, _FLARE_PX = 24, 1.0
+#: What all sides are counts so much of what the sides beside are.
+_ALL_SIDES = 1.0
 #: Directions that a plan's sides may face, and looks over an aperture.
 _DIRECTIONS, _LOOKS = 120, 9
 #: A side that holds this share of the outline gets finer directions round it: so many, so far apart (rad).
@@ -287,7 +289,7 @@ def _agreed_support(sides: Sequence[SilhouetteSides]) -> FloatArray:
     beside = np.abs(np.mod(phi[:, None] - phi[None, :] + math.pi, TWO_PI) - math.pi) <= half[:, None] + 1e-9
     ballots = np.eye(len(SHAPES))[shape]
     votes = beside.astype(np.float64) @ ballots
-    votes += votes.sum(axis=1, keepdims=True) * ballots.mean(axis=0)
+    votes += _ALL_SIDES * votes.sum(axis=1, keepdims=True) * ballots.mean(axis=0)
     # What a view alone says breaks a tie.
     votes[np.arange(len(shape)), shape] += 0.5
     agreed = by_shape[np.arange(len(shape)), votes.argmax(axis=1)]
@@ -579,9 +581,9 @@ def measure_object(
     Dimensions
         Length, width, heading and position of the plan, from the silhouettes (from the surface where the
         aperture is too narrow to smear them by half a voxel and a quarter of a cell); height from the
-        shadows' lengths if these agree on one, otherwise from the carved layers; volume of the surface. Intervals of length and width come from resampling the views in blocks
-        of an aperture (neighbours share their looks), with the error of an edge (0.6 of a cross-range cell)
-        added in quadrature.
+        shadows' lengths if these agree on one, otherwise from the carved layers; volume of the surface.
+        Intervals of length and width come from resampling the views in blocks of an aperture (neighbours
+        share their looks), with the error of an edge (0.6 of a cross-range cell) added in quadrature.
 
     Notes
     -----
