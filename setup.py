@@ -124,7 +124,7 @@ setup(
     extras_require={"ros": ROS, "test": TEST, "bench": BENCH, "build": BUILD, "dev": TEST + BUILD},
     entry_points={
         "console_scripts": [
-            "csas-shadow = csas_shadow_ros.cli:main",
+            "csas-shadow = csas_shadow_ros.__main__:main",
             *(f"{node} = {NAME}.nodes.start:{node}" for node in NODES),
         ]
     },

@@ -772,7 +772,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return FAILED
 
 
-def _entry() -> NoReturn:
+def run_and_exit() -> NoReturn:
+    """Run the command line as a program: what SIGTERM and SIGHUP end is brought to an end in order."""
     for name in ("SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
         if number and signal.getsignal(number) == signal.SIG_DFL:
@@ -782,4 +783,4 @@ def _entry() -> NoReturn:
 
 
 if __name__ == "__main__":
-    _entry()
+    run_and_exit()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import fcntl
 import json
+import math
 import os
 import random
 import shutil
@@ -41,12 +43,18 @@ _START_ORDER = (
 )
 #: Each process has its own numerical libraries: as many threads in each as there are cores would only wait.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+#: What a node that is started again is told besides: the recording is there, and to be gone on with.
+_AGAIN = {"bag_recorder": "resume:=true"}
 #: A fork server that is told to end gets so long, and one that is asked for a node so long: what it loads may
 #: have to be compiled first.
 _GRACE_S, _PATIENCE_S = 5.0, 120.0
 #: With less shared memory than the segments of a graph may come to fill, a write into them is a bus error:
 #: then the middleware's own, smaller ones do, more slowly.
 _SHARED_MEMORY = 1 << 30
+#: The middleware's segments, and the name of the file that their owner holds locked.
+_SEGMENTS, _OWNER = "/dev/shm/fastrtps_", "_el"
+#: How often it is looked which a process has: it makes them as it starts.
+_LOOK_S = 1.0
 #: Views are a few MB: by default glibc gives such memory back at once, and a quarter of the nodes' time went
 #: into getting it again, page by page.
 _MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(1 << 26), "MALLOC_TRIM_THRESHOLD_": str(1 << 28)}
@@ -99,6 +107,35 @@ def free_shared_memory() -> int:
         return shutil.disk_usage("/dev/shm").free
     except OSError:
         return 0
+
+
+def segments_of(pid: int) -> set[Path]:
+    """Return the shared memory segments of the middleware that a process owns (not its ports)."""
+    found = set()
+    try:
+        for entry in os.listdir(f"/proc/{pid}/fd"):
+            with contextlib.suppress(OSError):
+                path = os.readlink(f"/proc/{pid}/fd/{entry}")
+                if path.startswith(_SEGMENTS) and path.endswith(_OWNER) and "_port" not in path:
+                    found.add(Path(path.removesuffix(_OWNER)))
+    except OSError:
+        pass  # it has ended
+    return found
+
+
+def remove_segment(segment: Path) -> bool:
+    """Remove a segment that a killed process left; True if nobody owns it and it is gone."""
+    owner = segment.with_name(segment.name + _OWNER)
+    try:
+        with owner.open("rb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            segment.unlink(missing_ok=True)
+            owner.unlink(missing_ok=True)
+    except FileNotFoundError:
+        return False  # its owner took it away itself
+    except OSError:
+        return False  # somebody owns it
+    return True
 
 
 def graph_environment(domain_id: int, log_dir: Path) -> dict[str, str]:
@@ -425,6 +462,8 @@ class GraphProcess:
         self._asked_s = 0.0
         self._process: subprocess.Popen[bytes] | _Forked | None = None
         self._log_file: IO[bytes] | None = None
+        self._segments: set[Path] = set()
+        self._looked_s = -math.inf
 
     @property
     def pid(self) -> int:
@@ -444,17 +483,37 @@ class GraphProcess:
         """Start the process, or start it again."""
         self.restarts += 1
         self._process = None
+        self.clean_up()
         if self._server is None:
             self._start_alone()
         else:
             self._asked_s = time.monotonic()
-            self._coming = self._server.start(self.node, self._arguments, self.log)
+            self._coming = self._server.start(self.node, self._all_arguments(), self.log)
+
+    def _all_arguments(self) -> list[str]:
+        again = _AGAIN.get(self.node) if self.restarts > 0 else None
+        if again is None:
+            return self._arguments
+        return [*(self._arguments or ["--ros-args"]), "-p", again]
+
+    def look(self) -> None:
+        """Note, now and then, which shared memory the process owns."""
+        if self._process is not None and time.monotonic() - self._looked_s > _LOOK_S:
+            self._looked_s = time.monotonic()
+            self._segments |= segments_of(self._process.pid)
+
+    def clean_up(self) -> None:
+        """Remove the shared memory of a process that was killed: nobody else would, before the next boot."""
+        for segment in self._segments:
+            remove_segment(segment)
+        self._segments.clear()
+        self._looked_s = -math.inf
 
     def _start_alone(self) -> None:
         self.close_log()
         self._log_file = self.log.open("ab")
         self._process = subprocess.Popen(
-            [sys.executable, "-m", f"{PACKAGE}.nodes.{self.node}", *self._arguments],
+            [sys.executable, "-m", f"{PACKAGE}.nodes.{self.node}", *self._all_arguments()],
             env=self._environment,
             stdin=subprocess.DEVNULL,
             stdout=self._log_file,
@@ -584,6 +643,7 @@ class Graph:
         for name, process in self.processes.items():
             code = process.poll()
             if code is None:
+                process.look()
                 continue
             if code == 2:
                 raise ReplayError(f"{name} refused to start: {process.last_line()}")
@@ -603,6 +663,7 @@ class Graph:
             for name, process in self.processes.items():
                 process.wait(30.0 if name == "bag_recorder" else 5.0)
                 process.close_log()
+                process.clean_up()
         except BaseException:
             # Another Ctrl-C: no process is left behind for that, not even as a zombie.
             if self._server is not None:
@@ -612,4 +673,5 @@ class Graph:
             for process in self.processes.values():
                 process.wait(5.0)
                 process.close_log()
+                process.clean_up()
             raise

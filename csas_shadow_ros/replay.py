@@ -49,6 +49,8 @@ _CHAIN = {
     "shadow_mask": ("voxel_carver",),
 }
 _WITH_COMPOSITES = ("image", "sector", "sub_aperture")
+
+
 @dataclass(frozen=True)
 class NodeReport:
     """What one node says of its part.
@@ -139,13 +141,16 @@ class ReplayResult:
 
 
 class _Watcher:
-    """Listens to a graph: progress first, and results once they are complete."""
+    """Listens to a graph: progress first, and results once they are complete.
+
+    It looks at what has come a few times a second and has no executor, which would gather all of the node's
+    entities for each message anew: the nodes report every view, four times over, and need the processor.
+    """
 
     def __init__(self, graph: Graph, domain_id: int) -> None:
         # Late, so that reading this module needs no ROS.
         import rclpy
         from rclpy.context import Context
-        from rclpy.executors import SingleThreadedExecutor
 
         from msg_adapters import RclpyMessages
 
@@ -159,10 +164,10 @@ class _Watcher:
         try:
             with environment_of(own):
                 rclpy.init(context=self._context, domain_id=domain_id)
-                self._node = rclpy.create_node("replay", context=self._context, namespace="csas")
-            # Not the one that nodes have: there a Ctrl-C that falls into a message becomes another error.
-            self._executor = SingleThreadedExecutor(context=self._context)
-            self._executor.add_node(self._node)
+                # Nobody would answer who asks for its parameters.
+                self._node = rclpy.create_node(
+                    "replay", context=self._context, namespace="csas", start_parameter_services=False
+                )
         except BaseException:
             rclpy.try_shutdown(context=self._context)
             raise
@@ -171,19 +176,28 @@ class _Watcher:
         self.rejected: dict[tuple[int, str], RejectedView] = {}
         self.errors: dict[str, str] = {}
         self.latest: dict[str, Any] = {}
-        self._subscribe("progress", qos.REPORTS, self._on_progress)
+        self._subscriptions: list[Any] = []
+        self._subscribe("progress", qos.REPORTS, self._on_progress, raw=True)
 
-    def _subscribe(self, topic: str, profile: Any, callback: Callable[[Any], None]) -> None:
+    def _subscribe(
+        self, topic: str, profile: Any, callback: Callable[[Any], None], *, raw: bool = False
+    ) -> None:
         from msg_adapters import TOPICS
 
         kind = self._messages.cls(TOPICS[topic].type_name)
-        self._node.create_subscription(kind, topic, callback, profile)
+        self._subscriptions.append(self._node.create_subscription(kind, topic, callback, profile, raw=raw))
 
-    def _on_progress(self, msg: Any) -> None:
-        from msg_adapters import Heartbeat, progress_from_msg
+    def _on_progress(self, cdr: bytes) -> None:
+        from rclpy.serialization import deserialize_message
 
+        from msg_adapters import TOPICS, Heartbeat, is_routine_report, progress_from_msg
+
+        if is_routine_report(cdr):
+            return  # it changes nothing here, and a run has thousands
         try:
-            item = progress_from_msg(msg)
+            item = progress_from_msg(
+                deserialize_message(cdr, self._messages.cls(TOPICS["progress"].type_name))
+            )
         except CsasError:
             return  # an outside node's; the graph's own are well-formed
         if isinstance(item, Heartbeat):
@@ -217,11 +231,15 @@ class _Watcher:
         return True
 
     def spin(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
+        """Take what has come, then let so much time pass."""
         # What a signal raises in the middle of a callback would leave the middleware half undone.
         with signals_deferred():
-            while (left := end - time.monotonic()) > 0:
-                self._executor.spin_once(timeout_sec=left)
+            for subscription in self._subscriptions:
+                handle = subscription.handle
+                with handle:
+                    while (taken := handle.take_message(subscription.msg_type, subscription.raw)) is not None:
+                        subscription.callback(taken[0])
+        time.sleep(seconds)
 
     def collect(self, topics: tuple[str, ...], timeout_s: float) -> dict[str, Any]:
         """Return the last message of latched topics: whoever subscribes now gets the final ones."""
@@ -233,7 +251,6 @@ class _Watcher:
         return self.latest
 
     def close(self) -> None:
-        self._executor.shutdown(timeout_sec=1.0)
         self._node.destroy_node()
         self._rclpy.shutdown(context=self._context)
 
@@ -334,6 +351,12 @@ def replay(
             out = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="csas_replay_")))
         else:
             out = Path(out_dir)
+            try:
+                out.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise ParameterError(
+                    f"out_dir is {str(out)!r} ({error.strerror}); expected a folder that can be written to"
+                ) from None
         recording = None if record is False else out / "recording" if record is True else Path(record)
         chosen, target = _plan(bag, stage, p)
         plan = _node_plan(bag, chosen, p, target, rate, recording, composites, window, overrides or {})

@@ -43,7 +43,15 @@ from .pairs import (
     voxel_grid_from_msgs,
     voxel_grid_to_msgs,
 )
-from .progress import Heartbeat, Level, ViewProgress, diagnostics_to_msg, progress_from_msg, progress_to_msg
+from .progress import (
+    Heartbeat,
+    Level,
+    ViewProgress,
+    diagnostics_to_msg,
+    is_routine_report,
+    progress_from_msg,
+    progress_to_msg,
+)
 from .target import TargetBox, target_from_msg, target_may_move, target_to_msg
 from .topics import NAMESPACE, STREAMS, TOPICS, VIEW_STREAMS, ImageStream, Topic, absolute_name
 from .track import track_from_msg, track_to_msg
@@ -81,6 +89,7 @@ __all__ = [
     "ground_picture_to_msgs",
     "image_from_msg",
     "image_to_msg",
+    "is_routine_report",
     "mesh_from_msg",
     "mesh_to_msg",
     "pixels_from_msg",

@@ -17,6 +17,7 @@ INTEGRATED = "integrated"
 PUBLISHED = "published"
 REJECTED = "rejected"
 ROLES = ("source", "stage", "sink")
+_NEWS = (HEARTBEAT.encode(), REJECTED.encode())
 
 
 class Level(IntEnum):
@@ -140,6 +141,14 @@ def diagnostics_to_msg(
         values=pairs,
     )
     return factory.make(DIAGNOSTICS, header=make_header(factory, stamp_ns), status=[status])
+
+
+def is_routine_report(cdr: bytes) -> bool:
+    """Say whether a serialised message of topic `progress` can only tell that a view went well.
+
+    Whoever follows heartbeats and refusals alone need not read it; a False says nothing.
+    """
+    return not any(word in cdr for word in _NEWS)
 
 
 def progress_from_msg(msg: Any) -> ViewProgress | Heartbeat:

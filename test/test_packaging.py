@@ -96,7 +96,7 @@ def test_the_wheel_holds_every_module_configuration_and_launch_file(wheel):
 def test_the_wheel_declares_a_command_for_each_node_and_the_extras(wheel):
     info = f"csas_shadow_ros-{csas_shadow_ros.__version__}.dist-info"
     entries = wheel.read(f"{info}/entry_points.txt").decode()
-    assert "csas-shadow = csas_shadow_ros.cli:main" in entries
+    assert "csas-shadow = csas_shadow_ros.__main__:main" in entries
     for node in nodes():
         assert f"{node} = csas_shadow_ros.nodes.start:{node}" in entries
     metadata = wheel.read(f"{info}/METADATA").decode()

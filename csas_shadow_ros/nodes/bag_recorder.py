@@ -104,8 +104,10 @@ class BagRecorderNode(CsasNode):
             raise BagError(f"{out} is being recorded by another process") from None
         self._lock = lock
         cut = out.with_name(f"{out.name}.cut")
-        if out.exists() and not (out / "metadata.yaml").exists():
-            # A recorder was killed here: its bag has no end. What it holds goes into the new one.
+        finished = (out / "metadata.yaml").exists()
+        if out.exists() and (self.parameters.resume or not finished):
+            # A recorder was killed here: its bag has no end. Or it was ended, and is to go on. What the bag
+            # holds goes into the new one.
             if cut.exists():
                 raise BagError(f"{cut} and {out} are both unfinished; expected one of them at most")
             out.rename(cut)

@@ -25,6 +25,7 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 
 from csas_shadow_ros.core.errors import CsasError, ParameterError
@@ -38,6 +39,7 @@ from msg_adapters import (
     TargetBox,
     ViewProgress,
     diagnostics_to_msg,
+    is_routine_report,
     progress_from_msg,
     progress_to_msg,
     stamp_to_ns,
@@ -213,10 +215,12 @@ class CsasNode(LifecycleNode):
 
     def follow_sources(self) -> None:
         """Listen to the sources' heartbeats."""
-        self.subscribe("progress", qos.REPORTS, self._on_progress)
+        self.subscribe("progress", qos.REPORTS, self._on_progress, raw=True)
 
-    def _on_progress(self, msg: Any) -> None:
-        item = progress_from_msg(msg)
+    def _on_progress(self, cdr: bytes) -> None:
+        if is_routine_report(cdr):
+            return  # most are, and to read one takes as long as to carve from a view
+        item = progress_from_msg(deserialize_message(cdr, self.messages.cls(TOPICS["progress"].type_name)))
         if isinstance(item, Heartbeat) and item.role == "source":
             self.on_source(item)
 

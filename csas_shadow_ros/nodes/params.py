@@ -139,6 +139,7 @@ class BagRecorderNodeParameters(NodeParameters):
     """Parameters of `bag_recorder`."""
 
     out: str = bounded("", "bag to make: a directory that does not exist yet")
+    resume: bool = bounded(False, "go on with a recording that is there already, instead of refusing it")
     compress: bool = bounded(True, "compress with zstd")
     topics: str = bounded("all", "topics to record, relative, separated by commas; all: the whole contract")
 

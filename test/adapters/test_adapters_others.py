@@ -16,9 +16,11 @@ from msg_adapters import (
     AdapterError,
     Heartbeat,
     Level,
+    RclpyMessages,
     RosbagsMessages,
     TargetBox,
     ViewProgress,
+    is_routine_report,
     mesh_from_msg,
     mesh_to_msg,
     progress_from_msg,
@@ -334,6 +336,14 @@ PROGRESS = [
 @pytest.mark.parametrize("item", PROGRESS)
 def test_progress_and_heartbeats_survive_the_round_trip(factory, item):
     assert progress_from_msg(progress_to_msg(factory, item)) == item
+
+
+@pytest.mark.parametrize("item", PROGRESS)
+def test_only_what_went_well_with_a_view_is_routine(item):
+    serialization = pytest.importorskip("rclpy.serialization")
+    cdr = serialization.serialize_message(progress_to_msg(RclpyMessages(), item))
+    went_well = isinstance(item, ViewProgress) and item.outcome != "rejected"
+    assert is_routine_report(cdr) == went_well
 
 
 def test_a_rejected_view_is_no_ok_status(factory):

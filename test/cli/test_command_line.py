@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import io
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -611,3 +612,44 @@ def test_replay_leaves_the_folder_that_run_leaves_with_the_same_grid(tiny_box_ba
     assert counts["voxel_grid"] == 1
     assert {"sub_aperture", "voxel_carver"} <= set(report["nodes"])
     assert (tmp_path / "graph" / "log" / "voxel_carver.log").exists()
+
+
+EARLY_INTERRUPT = """
+import os, signal, sys
+
+def find_spec(name, path=None, target=None):
+    if name == "csas_shadow_ros.core.errors":
+        os.kill(os.getpid(), signal.SIGINT)
+        sum(range(1000))
+
+sys.meta_path.insert(0, type("Interrupter", (), {"find_spec": staticmethod(find_spec)}))
+from csas_shadow_ros.__main__ import main
+main()
+"""
+
+
+def test_an_interrupt_before_the_command_line_is_there_ends_in_one_line():
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", EARLY_INTERRUPT],
+        env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert (done.returncode, done.stderr) == (1, "csas-shadow: error: interrupted\n")
+
+
+def test_the_package_runs_as_a_module():
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run(
+        [sys.executable, "-m", "csas_shadow_ros", "--version"],
+        env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 0
+    assert done.stdout.startswith("csas-shadow ")

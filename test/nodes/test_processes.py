@@ -32,6 +32,7 @@ from csas_shadow_ros.graph import (
     ReplayError,
     free_domain_id,
     graph_environment,
+    segments_of,
     start_fork_server,
 )
 from csas_shadow_ros.replay import replay
@@ -229,6 +230,58 @@ def test_a_recorder_that_is_interrupted_finishes_its_bag(tmp_path: Path) -> None
     assert (out / "metadata.yaml").exists()
 
 
+def test_a_recorder_that_is_ended_in_mid_run_goes_on_with_its_bag(
+    run_bag: Path, reference: Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graphs: list[Graph] = []
+
+    class Watched(Graph):
+        def __enter__(self) -> Graph:
+            graphs.append(self)
+            return super().__enter__()
+
+    monkeypatch.setattr(module, "Graph", Watched)
+    ended: list[int] = []
+
+    def end_it(done: int, total: int) -> None:
+        if not ended and 2 <= done < total - 2:
+            ended.append(done)
+            # As a system that is told to stop one service does; the recorder finishes its bag and is gone.
+            graphs[-1].processes["bag_recorder"].signal(signal.SIGTERM)
+
+    for attempt in range(3):  # a busy machine may hear of the whole short run at once
+        folder = tmp_path / str(attempt)
+        result = replay(run_bag, folder, PARAMETERS, record=True, composites=False, progress=end_it)
+        if ended:
+            break
+    assert ended
+    assert_same_grid(result, reference)
+    run = read_run(folder / "recording")
+    for stream in ("sub_aperture", "shadow", "likelihood", "shadow_mask"):
+        assert run.counts[stream] == result.views_total, stream
+
+
+def test_a_recording_that_is_there_is_refused_unless_it_is_to_be_gone_on_with(
+    run_bag: Path, tmp_path: Path
+) -> None:
+    recording = ("-p", f"out:={run_bag}")
+    process = run_node("bag_recorder", *recording, log_dir=tmp_path, domain=free_domain_id())
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "exists" in stderr
+    assert read_run(run_bag).require_track()
+
+
+def test_a_results_folder_that_is_a_file_is_refused_by_name(run_bag: Path, tmp_path: Path) -> None:
+    file = tmp_path / "results"
+    file.write_text("mine")
+    with pytest.raises(ParameterError, match=r"out_dir is '.*results' .*expected a folder"):
+        replay(run_bag, file, progress=False)
+    with pytest.raises(ParameterError, match=r"out_dir is '.*below' .*expected a folder"):
+        replay(run_bag, file / "below", progress=False)
+    assert file.read_text() == "mine"
+
+
 @pytest.mark.parametrize("forked", [False, True])
 def test_nodes_end_when_the_process_that_started_them_was_killed(tmp_path: Path, forked: bool) -> None:
     code = (
@@ -286,6 +339,40 @@ def test_processes_that_end_leave_no_shared_memory(tmp_path: Path, forked: bool)
             running(graph, tmp_path, node)
         assert segments() - before
     assert segments() <= before
+
+
+@pytest.mark.parametrize("forked", [False, True])
+def test_the_shared_memory_of_a_killed_node_is_taken_away_and_no_other(tmp_path: Path, forked: bool) -> None:
+    domain, before = free_domain_id(), segments()
+
+    def owned(pid: int) -> set[str]:
+        return {path.name for path in segments_of(pid)}
+
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(start_fork_server(domain, tmp_path)) if forked else None
+        nodes: dict[str, dict[str, Any]] = {"composites": {}, "shadow_likelihood": {}}
+        graph = stack.enter_context(Graph(nodes, domain, tmp_path, server=server))
+        for node in graph.processes:
+            running(graph, tmp_path, node)
+        graph.watch()  # as a replay does all the time
+        victim, other = graph.processes["composites"].pid, graph.processes["shadow_likelihood"].pid
+        lost, kept = owned(victim), owned(other)
+        assert lost
+        assert kept
+        os.kill(victim, signal.SIGKILL)
+        deadline = time.monotonic() + 30
+        while not graph.deaths:
+            assert time.monotonic() < deadline
+            graph.watch()
+            time.sleep(0.05)
+        assert not lost & segments()
+        assert kept <= segments()
+        running(graph, tmp_path, "composites")
+        assert owned(graph.processes["composites"].pid) <= segments()
+        # A last one is killed as the graph ends: nobody starts it again.
+        graph.processes["composites"].look()
+        os.kill(graph.processes["composites"].pid, signal.SIGKILL)
+    assert not {name for name in segments() - before if "_port" not in name}
 
 
 def test_nodes_outlive_the_process_that_forked_them_and_are_started_again_without_it(tmp_path: Path) -> None:
