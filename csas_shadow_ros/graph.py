@@ -274,7 +274,8 @@ class ForkServer:
         try:
             with log.open("ab") as output:
                 self._server = subprocess.Popen(
-                    [sys.executable, "-m", f"{PACKAGE}.nodes.fork_server", *_START_ORDER[:2]],
+                    # The player needs little, and reads the bag while the others' kernels are loaded.
+                    [sys.executable, "-m", f"{PACKAGE}.nodes.fork_server", _START_ORDER[0]],
                     env=dict(environment),
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,

@@ -474,13 +474,14 @@ def _until_complete(
         for name, text in watcher.errors.items():
             raise _error_of(name, text)
         beat = watcher.beats.get((sender, source))
+        if beat is not None:
+            # What the result takes is loaded while the nodes wait for the image and look for the target:
+            # later they need every core.
+            import trimesh  # noqa: F401
+
+            from .core import mesh, target, threshold  # noqa: F401
         if beat is not None and beat.counts.get("total"):
             progress(beat.counts["done"], beat.counts["total"])
-            if beat.counts["done"]:
-                # What the result takes is loaded while the nodes work, not when they have ended.
-                import trimesh  # noqa: F401
-
-                from .core import mesh, target, threshold  # noqa: F401
         if beat is not None and beat.counts.get("finished") and _sinks_complete(graph, watcher):
             progress(beat.counts["done"], beat.counts["total"])
             return

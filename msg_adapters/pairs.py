@@ -90,10 +90,15 @@ def view_from_msgs(image: Any, info: Any, stream_name: str) -> View:
     return View(view_info, image_from_msg(image, stream_name))
 
 
-def view_to_msgs(factory: MessageFactory, view: View, stream_name: str) -> tuple[Any, Any]:
-    """Make (Image, CameraInfo) of a view; both carry the view's stamp."""
+def view_to_msgs(
+    factory: MessageFactory, view: View, stream_name: str, *, trusted: bool = False
+) -> tuple[Any, Any]:
+    """Make (Image, CameraInfo) of a view; both carry the view's stamp.
+
+    `trusted` as of `image_to_msg`: a stage's own views are looked at by whoever takes them.
+    """
     return (
-        image_to_msg(factory, view.pixels, view.info.stamp_ns, stream_name),
+        image_to_msg(factory, view.pixels, view.info.stamp_ns, stream_name, trusted=trusted),
         view_info_to_msg(factory, view.info, stream_name),
     )
 

@@ -233,13 +233,15 @@ def odd_sectors(infos: Iterable[SectorInfo]) -> dict[int, str]:
 
 @dataclass(frozen=True, eq=False)
 class MessagePair:
-    """An image and its camera_info, decoded but not checked."""
+    """An image and its camera_info, decoded but not checked, and both as they were recorded."""
 
     topic: str
     number: int
     stamp_ns: int
     image: Any
     info: Any
+    image_cdr: memoryview
+    info_cdr: memoryview
 
 
 def checked_messages(
@@ -257,7 +259,11 @@ def checked_messages(
     if info.type_name != expected:
         report(Problem(info.name, None, None, f"its type is {info.type_name!r}; expected {expected}"))
         return
-    seen: dict[int, bytes] = {}
+    seen: dict[int, bytes | memoryview] = {}
+
+    def digest(cdr: memoryview) -> bytes:
+        return hashlib.blake2b(cdr, digest_size=16).digest()
+
     for message in reader.messages([info.name]):
         try:
             decoded = message.decode()
@@ -265,13 +271,13 @@ def checked_messages(
         except CsasError as error:
             report(Problem(info.name, message.number, None, str(error)))
             continue
-        digest = hashlib.blake2b(message.cdr, digest_size=16).digest()
-        if stamp in seen:
-            if seen[stamp] != digest:
+        if (before := seen.get(stamp)) is not None:
+            if (digest(before) if isinstance(before, memoryview) else before) != digest(message.cdr):
                 reason = "differs from an earlier message of the same stamp"
                 report(Problem(info.name, message.number, stamp, reason))
             continue
-        seen[stamp] = digest
+        # An image that is alone takes a second to digest, and is compared with nothing.
+        seen[stamp] = message.cdr if info.count == 1 else digest(message.cdr)
         yield message, decoded, stamp
 
 
@@ -292,7 +298,7 @@ def iterate_pairs(
     kind = stream(stream_name)
     info_topic = absolute_name(kind.info_topic, reader.namespace)
     # Camera infos are small: all are read first, so that no image ever waits in memory.
-    infos = {s: (m.number, d) for m, d, s in checked_messages(reader, kind.info_topic, report)}
+    infos = {s: (m, d) for m, d, s in checked_messages(reader, kind.info_topic, report)}
     used: set[int] = set()
     for message, image, stamp in checked_messages(reader, kind.image_topic, report):
         if stamp not in infos:
@@ -303,10 +309,11 @@ def iterate_pairs(
             report(Problem(message.topic, message.number, stamp, missing))
             continue
         used.add(stamp)
-        yield MessagePair(message.topic, message.number, stamp, image, infos[stamp][1])
-    for stamp, (number, _) in infos.items():
+        own, info = infos[stamp]
+        yield MessagePair(message.topic, message.number, stamp, image, info, message.cdr, own.cdr)
+    for stamp, (own, _) in infos.items():
         if stamp not in used:
-            report(Problem(info_topic, number, stamp, "has no image of the same stamp"))
+            report(Problem(info_topic, own.number, stamp, "has no image of the same stamp"))
 
 
 def read_run(path: str | Path, namespace: str | None = None) -> Run:

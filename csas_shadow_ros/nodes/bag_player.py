@@ -6,14 +6,14 @@ import sys
 import time
 from typing import Any
 
-from csas_shadow_ros.bags import BagReader, iterate_pairs
+from csas_shadow_ros.bags import BagReader, MessagePair, iterate_pairs
 from csas_shadow_ros.bags.run import Problem
 from csas_shadow_ros.core.errors import BagError, CsasError, ParameterError
 from msg_adapters import coherent_image_from_msgs, track_from_msg
 
 from . import qos
 from .base import CsasNode, Source, run_node
-from .playing import BagViews, header_stamp, stage_of_bag
+from .playing import BagViews, stage_of_bag
 
 
 class BagPlayerNode(CsasNode):
@@ -53,9 +53,13 @@ class BagPlayerNode(CsasNode):
 
     def latch_image(self) -> None:
         """Publish the first usable image; an unusable one if there is no other, so that it gets named."""
-        chosen: int | None = None
+        found = self.reader.topic("image")
+        alone = found is not None and found.count == 1
+        chosen: MessagePair | None = None
         for pair in iterate_pairs(self.reader, "image", self._problem):
-            chosen = pair.stamp_ns
+            chosen = pair
+            if alone:
+                break  # whoever takes it looks at its pixels
             try:
                 coherent_image_from_msgs(pair.image, pair.info)
                 break
@@ -63,15 +67,8 @@ class BagPlayerNode(CsasNode):
                 self._problem(Problem(pair.topic, pair.number, pair.stamp_ns, str(error)))
         if chosen is None:
             raise BagError(f"{self.parameters.bag} holds no image with a camera_info of the same stamp")
-        for relative in ("camera_info", "image"):
-            for message in self.reader.messages([relative]):
-                try:
-                    found = header_stamp(message.cdr, message.topic)
-                except BagError:
-                    continue  # named before
-                if found == chosen:
-                    self.latch(relative, message.cdr)
-                    break
+        self.latch("camera_info", chosen.info_cdr)
+        self.latch("image", chosen.image_cdr)
 
     def latch_track(self) -> None:
         """Publish the longest track; of a track that grew during the run it is the whole."""

@@ -133,16 +133,15 @@ class BagRecorderNode(CsasNode):
         cut.rmdir()
 
     def _record(self, topic: str) -> None:
-        profile = qos.LATCHED if topic in _LATCHED else qos.VIEWS
-        if topic in ("progress", "/diagnostics"):
-            profile = qos.UNLATCHED
+        profile = qos.UNLATCHED if topic in ("progress", "/diagnostics") else qos.VIEWS
 
         def take(cdr: Any) -> None:
             self._write(topic, cdr, time.time_ns())
 
-        self.subscribe(topic, profile, take, raw=True)
         if topic in _LATCHED:
-            self.subscribe(topic, qos.UNLATCHED, take, raw=True)
+            self.subscribe_latched(topic, take, raw=True)
+        else:
+            self.subscribe(topic, profile, take, raw=True)
 
     def _write(self, topic: str, cdr: bytes, when: int, *, report: bool = True) -> None:
         if self.writer is None:

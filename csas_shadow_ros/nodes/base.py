@@ -25,8 +25,10 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 
 from csas_shadow_ros.core.errors import CsasError, ParameterError
 from csas_shadow_ros.core.geometry import View
@@ -63,6 +65,8 @@ BEAT_S = 0.5
 _LOG_EVERY_S = 10.0
 _MAX_KINDS = 32
 _LONELY_S = 5.0
+#: How often it is looked who publishes latched topics: sooner than a large image is through.
+_DURABILITY_S = 0.05
 
 
 def kind_of(reason: str) -> str:
@@ -180,7 +184,7 @@ class CsasNode(LifecycleNode):
 
     def subscribe(
         self, topic: str, profile: Any, callback: Callable[[Any], None], *, raw: bool = False
-    ) -> None:
+    ) -> Subscription:
         """Subscribe to a topic of the contract; nothing that the callback raises ends the node."""
 
         def guarded(msg: Any) -> None:
@@ -190,11 +194,19 @@ class CsasNode(LifecycleNode):
         kind = self.messages.cls(TOPICS[topic].type_name)
         made = self.create_subscription(kind, topic, guarded, profile, raw=raw)
         self._owned.append((self.destroy_subscription, made))
+        return made
+
+    def unsubscribe(self, subscription: Subscription) -> None:
+        """Take a subscription back."""
+        self._owned.remove((self.destroy_subscription, subscription))
+        self.destroy_subscription(subscription)
 
     def subscribe_latched(self, topic: str, callback: Callable[[Any], None], *, raw: bool = False) -> None:
         """Subscribe to a latched topic, whether or not its publisher really latches it."""
         self.subscribe(topic, qos.LATCHED, callback, raw=raw)
-        self.subscribe(topic, qos.UNLATCHED, callback, raw=raw)
+        unlatched = Unlatched(self, topic, lambda: self.subscribe(topic, qos.UNLATCHED, callback, raw=raw))
+        self._owned.append((Unlatched.drop, unlatched))
+        self.every(_DURABILITY_S, unlatched.look)
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call back periodically while the node is configured."""
@@ -480,6 +492,51 @@ class Background:
             self._node.guard("work", self._callback)
 
 
+class Unlatched:
+    """A second subscription to a latched topic, for publishers that do not latch it.
+
+    Such publishers do not match the first one, and those that latch match both: what they publish would come
+    twice, an image of hundreds of megabytes too. It is there as long as nobody publishes, or somebody who
+    does not latch.
+
+    Parameters
+    ----------
+    node : CsasNode
+        The node.
+    topic : str
+        Name of the topic.
+    subscribe : callable
+        Makes the subscription.
+    """
+
+    def __init__(self, node: CsasNode, topic: str, subscribe: Callable[[], Subscription]) -> None:
+        self._node = node
+        self._topic = topic
+        self._subscribe = subscribe
+        self._publishers = 0
+        self.subscription: Subscription | None = subscribe()
+
+    def look(self) -> None:
+        """Subscribe, or take the subscription back, as publishers have come and gone."""
+        count = self._node.count_publishers(self._topic)
+        if count == self._publishers:
+            return
+        self._publishers = count
+        name = self._node.resolve_topic_name(self._topic)
+        publishers = self._node.get_publishers_info_by_topic(name)
+        latching = [p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers]
+        wanted = not all(latching) or not latching
+        if wanted and self.subscription is None:
+            self.subscription = self._subscribe()
+        elif not wanted and self.subscription is not None:
+            self._node.unsubscribe(self.subscription)
+            self.subscription = None
+
+    def drop(self) -> None:
+        """Forget the subscription: the node destroys it."""
+        self.subscription = None
+
+
 class Inlet:
     """A stream of image and camera_info pairs that a node takes.
 
@@ -750,7 +807,7 @@ class ViewOutlet:
 
     def send(self, view: View) -> None:
         """Publish a view; its stamp goes out unchanged."""
-        image, info = view_to_msgs(self._node.messages, view, self._stream)
+        image, info = view_to_msgs(self._node.messages, view, self._stream, trusted=True)
         self._info.publish(info)
         self._image.publish(image)
 

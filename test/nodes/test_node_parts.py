@@ -277,6 +277,48 @@ def test_rubbish_on_the_wire_does_not_end_a_node(graph: Graph) -> None:
 # Playing
 
 
+class Listener(CompositesNode):
+    """Takes targets, which it knows by their stamps."""
+
+    def setup(self) -> None:
+        self.forget()
+        self.heard: list[int] = []
+        self.subscribe_latched("target", lambda msg: self.heard.append(msg.header.stamp.sec))
+
+    def tick(self) -> None:
+        """Nothing is published."""
+
+
+def test_what_is_latched_comes_once_and_what_is_not_latched_comes_too(graph: Graph) -> None:
+    node = graph.add(Listener)
+    outside, messages = graph.plain_node("outside"), RclpyMessages()
+    kind = messages.cls("visualization_msgs/msg/Marker")
+    there = lambda count: lambda: outside.count_subscribers("target") == count  # noqa: E731
+    graph.spin_until(there(2), what="both subscriptions, as nobody publishes")
+
+    def publish(publisher: Any, second: int) -> None:
+        message = kind()
+        message.header.stamp.sec = second
+        publisher.publish(message)
+        graph.spin_until(lambda: second in node.heard)
+        end = time.monotonic() + 0.5
+        graph.spin_until(lambda: time.monotonic() > end)
+
+    latching = outside.create_publisher(kind, "target", qos.LATCHED)
+    graph.spin_until(there(1), what="the second subscription is taken back")
+    publish(latching, 1)
+    forgetful = outside.create_publisher(kind, "target", qos.UNLATCHED)
+    graph.spin_until(there(2), what="somebody does not latch")
+    graph.spin_until(lambda: forgetful.get_subscription_count() == 1)
+    publish(forgetful, 2)
+    outside.destroy_publisher(forgetful)
+    graph.spin_until(there(1), what="only who latches is left")
+    publish(latching, 3)
+    assert node.heard == [1, 2, 3]
+    outside.destroy_publisher(latching)
+    graph.spin_until(there(2), what="whoever comes next may not latch")
+
+
 def test_a_pair_of_a_bag_can_be_had_again_in_any_order(view_bag: Callable[[str], Path]) -> None:
     views = BagViews(BagReader(view_bag("likelihood")), "likelihood")
     stamps = list(views.times)
