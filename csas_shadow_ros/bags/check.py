@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 
 from csas_shadow_ros.core.errors import BagError, CsasError
 from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, Track, View
+from msg_adapters.camera_info import SectorInfo
 from msg_adapters.pairs import (
     coherent_image_from_msgs,
     ground_picture_from_msgs,
@@ -44,6 +45,8 @@ MAX_ZEROS = 0.01
 #: A view's sonar may be this fraction of its range away from the track at the view's stamp.
 SONAR_TOLERANCE = 0.02
 _MAX_FFT_SIDE = 2048
+#: A stated aspect may be so far off from what the track has, beyond half a sector.
+_ASPECT_SLACK_RAD = math.radians(3.0)
 
 
 @dataclass(frozen=True)
@@ -379,6 +382,7 @@ def judge_sectors(run: Run, track: Track) -> Iterator[tuple[str, str, str]]:
             "Views in these arcs see little or nothing, and the shape may be wrong: record every sector.",
         )
     infos = [info for info in run.sector_infos() if info.stamp_ns in total.stamps]
+    yield from judge_sector_aspects(infos, track)
     for n, info in enumerate(infos):
         near = 0.01 * info.aperture_rad
         for other in infos[:n]:
@@ -391,6 +395,31 @@ def judge_sectors(run: Run, track: Track) -> Iterator[tuple[str, str, str]]:
                     " it counts twice",
                     "Give a sector that is sent again the stamp that it had: it then counts once.",
                 )
+
+
+def judge_sector_aspects(infos: Sequence[SectorInfo], track: Track) -> Iterator[tuple[str, str, str]]:
+    """Yield (level, problem, remedy) if the track has the sonar elsewhere at a sector's stamp."""
+    there = [i for i in infos if track.stamps_ns[0] <= i.stamp_ns <= track.stamps_ns[-1]]
+    was = np.interp([i.stamp_ns for i in there], track.stamps_ns, track.aspects_rad)
+
+    def off(stated: float, aspect: float, info: SectorInfo) -> float:
+        # A sector may be stamped at its beginning, in its middle or at its end.
+        return abs(math.remainder(stated - aspect, math.tau)) - info.aperture_rad / 2.0 - _ASPECT_SLACK_RAD
+
+    wrong = [(i, float(a)) for i, a in zip(there, was, strict=True) if off(i.aspect_rad, a, i) > 0.0]
+    if not wrong:
+        return
+    info, aspect = max(wrong, key=lambda one: off(one[0].aspect_rad, one[1], one[0]))
+    remedy = "Give the aspect of the sector's middle in radians, counter-clockwise from +x, and its stamp."
+    if all(off(math.radians(i.aspect_rad), a, i) <= 0.0 for i, a in wrong):
+        remedy = f"They look like degrees. {remedy}"
+    yield (
+        WARNING,
+        f"{len(wrong)} of {len(infos)} sectors state another aspect than the track has at their stamp, the"
+        f" one at {info.stamp_ns} ns {info.aspect_rad:.6g} rad instead of {aspect % math.tau:.6g}: it is not"
+        " known which arcs were seen",
+        remedy,
+    )
 
 
 def judge_amplitude(view: View) -> Iterator[tuple[str, str, str]]:

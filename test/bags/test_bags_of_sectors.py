@@ -116,6 +116,24 @@ def test_the_same_arc_under_two_stamps_is_told_of(run, sectors, tmp_path) -> Non
     assert "it counts twice" in warned
 
 
+def test_aspects_that_the_track_contradicts_are_told_of(run, sectors, tmp_path) -> None:
+    in_degrees = [replace(s, aspect_rad=math.degrees(s.aspect_rad)) for s in sectors]
+    told = texts(check_bag(written(tmp_path / "degrees", run, in_degrees)), "warning")
+    assert "12 sectors state another aspect than the track has at their stamp" in told
+    assert "look like degrees" in told
+    other_way = [replace(s, aspect_rad=-s.aspect_rad) for s in sectors]
+    told = texts(check_bag(written(tmp_path / "mirrored", run, other_way)), "warning")
+    assert "sectors state another aspect than the track has" in told
+    assert "degrees. Give" not in told
+    # Stamped where a sector begins or ends, and an aspect a whole turn on: both are right.
+    stamps = np.interp([s.aspect_rad + 0.25 for s in sectors], run.track.aspects_rad, run.track.stamps_ns)
+    early = [
+        replace(s, stamp_ns=int(stamp), aspect_rad=s.aspect_rad + math.tau)
+        for s, stamp in zip(sectors, stamps, strict=True)
+    ]
+    assert "another aspect" not in texts(check_bag(written(tmp_path / "turn", run, early)), "warning")
+
+
 def test_what_contradicts_itself_in_all_sectors_is_an_error_as_in_an_image(run, sectors, tmp_path) -> None:
     turned = [with_band(s, spectrum_sign=-1) for s in sectors]
     assert "spectrum_sign is -1" in texts(check_bag(written(tmp_path / "sign", run, turned)), "error")
