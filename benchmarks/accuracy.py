@@ -998,13 +998,31 @@ def short_cases(targets: Iterable[str] | None = None) -> list[Case]:
 
 
 def floor_of(rows: Iterable[Row], settings: Settings) -> dict[str, Any]:
-    """Return what a floor file holds: the default method's IoU with the hull, case by case."""
+    """Return what a floor file holds of the default method, case by case.
+
+    The IoU with the hull, and which of `SIZES` are within 5 % or a voxel: these must stay so.
+    """
+    rows = list(rows)
     values = {str(r.case): round(_iou(r), 4) for r in rows}
-    return {"profile": settings.profile, "step_deg": settings.step_deg, "iou_hull": values}
+    right = {
+        str(r.case): [
+            name for name, good in zip(SIZES, sizes_within(r, settings.voxel_size_m), strict=True) if good
+        ]
+        for r in rows
+    }
+    return {
+        "profile": settings.profile,
+        "step_deg": settings.step_deg,
+        "iou_hull": values,
+        "sizes_right": right,
+    }
 
 
 def below_floor(rows: Iterable[Row], settings: Settings, floor: Mapping[str, Any]) -> list[str]:
-    """Return a message for each case that has fallen more than `FLOOR_TOLERANCE` below its floor.
+    """Return a message for each case that has become worse.
+
+    Its IoU is more than `FLOOR_TOLERANCE` below its floor, or an extent that was right is more than 5 % or a
+    voxel off.
 
     Raises
     ------
@@ -1028,6 +1046,12 @@ def below_floor(rows: Iterable[Row], settings: Settings, floor: Mapping[str, Any
                 f"{row.case}: IoU with the hull is {value:.4f}; expected at least {least:.4f} (the floor)"
                 f" less {FLOOR_TOLERANCE:g}"
             )
+        found = size_errors(row)
+        for name, good in zip(SIZES, sizes_within(row, settings.voxel_size_m), strict=True):
+            if not good and name in floor["sizes_right"][str(row.case)]:
+                true = row.true_size[name]
+                value = f"{true + found[name]:.3f}" if name in found else "not known"
+                messages.append(f"{row.case}: {name} is {value}; expected {true:.3f} within 5 % or a voxel")
     return messages
 
 

@@ -296,6 +296,18 @@ def test_a_small_fall_is_allowed_and_a_larger_one_is_not(accuracy):
     assert len(accuracy.below_floor(rows_of(accuracy, {"box": [0.879]}), settings, floor)) == 1
 
 
+def test_an_extent_that_was_right_must_stay_right(accuracy):
+    settings = accuracy.Settings(step_deg=accuracy.SHORT_STEP_DEG)
+    low = SIZE | {"height_m": 0.37}
+    floor = accuracy.floor_of(rows_of(accuracy, {"box": [0.9]}), settings)
+    (message,) = accuracy.below_floor(rows_of(accuracy, {"box": [0.9]}, size=low), settings, floor)
+    assert message == "box, seed 1, clean: height_m is 0.370; expected 0.400 within 5 % or a voxel"
+    (message, *_) = accuracy.below_floor(rows_of(accuracy, {"box": [0.9]}, size={}), settings, floor)
+    assert "length_m is not known" in message
+    was_wrong = accuracy.floor_of(rows_of(accuracy, {"box": [0.9]}, size=low), settings)
+    assert not accuracy.below_floor(rows_of(accuracy, {"box": [0.9]}, size=low), settings, was_wrong)
+
+
 def test_a_floor_of_other_settings_or_without_the_case_is_refused(accuracy):
     settings = accuracy.Settings(step_deg=accuracy.SHORT_STEP_DEG)
     floor = accuracy.floor_of(rows_of(accuracy, {"box": [0.9]}), settings)
@@ -308,4 +320,7 @@ def test_a_floor_of_other_settings_or_without_the_case_is_refused(accuracy):
 def test_the_committed_floor_names_the_short_forms_cases(accuracy):
     floor = json.loads(accuracy.FLOOR.read_text(encoding="utf-8"))
     assert list(floor["iou_hull"]) == [str(case) for case in accuracy.short_cases()]
+    for case in accuracy.short_cases():
+        if case.condition == "clean":
+            assert floor["sizes_right"][str(case)] == list(accuracy.SIZES)
     assert accuracy.below_floor([], accuracy.Settings(step_deg=accuracy.SHORT_STEP_DEG), floor) == []
