@@ -44,7 +44,11 @@ _SECOND_LOOK_VOXELS = 2
 #: Threads that do it.
 _LOOKERS = 2
 #: Voxels a side of the square blocks of a slice that are counted as one where a mask allows it.
-_BLOCK = 16
+_BLOCK = 8
+#: Of a block that is not, parts of so many voxels a side are.
+_PART = 4
+#: What a block of voxels sees: shadow, lit seabed, nothing, or of each something.
+_SHADOW, _LIT, _NOTHING, _MIXED = 0, 1, 2, 3
 #: What an unknown pixel adds to the sums over a mask; blocks of more pixels than that are not looked up.
 _UNKNOWN = 1 << 16
 _NOWHERE = np.empty((0, 0), np.bool_)
@@ -143,6 +147,44 @@ def _cells_of_mask(
             cells[v, u] = code | ((right | low | both) & 16)
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _alike(
+    sums: NDArray[np.uint32],
+    a: NDArray[np.float64],
+    x0: float,
+    y0: float,
+    step: float,
+    i0: int,
+    i1: int,
+    j0: int,
+    j1: int,
+) -> int:  # pragma: no cover
+    """Say what voxels [j0, j1) × [i0, i1) of a slice see: all the same, one of these, or `_MIXED`."""
+    rows, cols = sums.shape[0] - 1, sums.shape[1] - 1
+    # Their pixels, and one more all round: rounding, and neighbours in interpolation.
+    y = y0 + j0 * step
+    du, dv = a[0, 0] * step, a[1, 0] * step
+    u = a[0, 0] * x0 + a[0, 1] * y + a[0, 2] + i0 * du
+    v = a[1, 0] * x0 + a[1, 1] * y + a[1, 2] + i0 * dv
+    ru, rv = (i1 - 1 - i0) * du, (i1 - 1 - i0) * dv
+    su, sv = (j1 - 1 - j0) * a[0, 1] * step, (j1 - 1 - j0) * a[1, 1] * step
+    left = math.floor(u + min(ru, 0.0) + min(su, 0.0)) - 1
+    right = math.floor(u + max(ru, 0.0) + max(su, 0.0)) + 3
+    top = math.floor(v + min(rv, 0.0) + min(sv, 0.0)) - 1
+    bottom = math.floor(v + max(rv, 0.0) + max(sv, 0.0)) + 3
+    if right <= 0 or bottom <= 0 or left >= cols or top >= rows:
+        return _NOTHING
+    area = (right - left) * (bottom - top)
+    if left < 0 or top < 0 or right > cols or bottom > rows or area >= _UNKNOWN:
+        return _MIXED
+    inside = np.uint32(sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left])
+    if inside == np.uint32(area) * np.uint32(_UNKNOWN):
+        return _NOTHING
+    if inside == np.uint32(0):
+        return _SHADOW
+    return _LIT if inside == np.uint32(area) else _MIXED
+
+
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
 def _carve_masks(
     cells: NDArray[np.uint8],
@@ -160,7 +202,8 @@ def _carve_masks(
 ) -> None:  # pragma: no cover
     """Add a mask at every voxel's shadow pixel (bilinear) to the slices [first, last).
 
-    A block of voxels whose shadow falls on pixels that are all alike is counted as one.
+    A block of voxels whose shadow falls on pixels that are all alike is counted as one; of another one the
+    parts that are so are at least not looked up voxel by voxel.
     """
     rows, cols = cells.shape
     ny, nx = total.shape[1:]
@@ -168,58 +211,56 @@ def _carve_masks(
     for k in range(first, last):
         a = affines[k]
         du, dv = a[0, 0] * step, a[1, 0] * step
-        eu, ev = a[0, 1] * step, a[1, 1] * step
         for bj in range(block_total.shape[1]):
             j0 = bj * _BLOCK
             j1 = min(j0 + _BLOCK, ny)
-            y = y0 + j0 * step
             for bi in range(block_total.shape[2]):
                 i0 = bi * _BLOCK
                 i1 = min(i0 + _BLOCK, nx)
-                # The block's pixels, and one more all round: rounding, and neighbours in interpolation.
-                u = a[0, 0] * x0 + a[0, 1] * y + a[0, 2] + i0 * du
-                v = a[1, 0] * x0 + a[1, 1] * y + a[1, 2] + i0 * dv
-                ru, rv = (i1 - 1 - i0) * du, (i1 - 1 - i0) * dv
-                su, sv = (j1 - 1 - j0) * eu, (j1 - 1 - j0) * ev
-                left = math.floor(u + min(ru, 0.0) + min(su, 0.0)) - 1
-                right = math.floor(u + max(ru, 0.0) + max(su, 0.0)) + 3
-                top = math.floor(v + min(rv, 0.0) + min(sv, 0.0)) - 1
-                bottom = math.floor(v + max(rv, 0.0) + max(sv, 0.0)) + 3
-                if right <= 0 or bottom <= 0 or left >= cols or top >= rows:
+                seen = _alike(sums, a, x0, y0, step, i0, i1, j0, j1)
+                if seen == _NOTHING:
                     continue
-                area = (right - left) * (bottom - top)
-                if left >= 0 and top >= 0 and right <= cols and bottom <= rows and area < _UNKNOWN:
-                    inside = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-                    inside = np.uint32(inside)
-                    if inside == np.uint32(area) * np.uint32(_UNKNOWN):
-                        continue
-                    if inside == np.uint32(0) or inside == np.uint32(area):
-                        block_count[k, bj, bi] += np.uint16(1)
-                        if inside:
-                            block_total[k, bj, bi] += one
-                        continue
-                for j in range(j0, j1):
-                    line_y = y0 + j * step
-                    u = a[0, 0] * x0 + a[0, 1] * line_y + a[0, 2]
-                    v = a[1, 0] * x0 + a[1, 1] * line_y + a[1, 2]
-                    for i in range(i0, i1):
-                        uu, vv = u + i * du, v + i * dv
-                        if uu < 0.0 or vv < 0.0 or uu > cols - 1 or vv > rows - 1:
+                if seen != _MIXED:
+                    block_count[k, bj, bi] += np.uint16(1)
+                    if seen == _LIT:
+                        block_total[k, bj, bi] += one
+                    continue
+                for pj in range(j0, j1, _PART):
+                    qj = min(pj + _PART, j1)
+                    for pi in range(i0, i1, _PART):
+                        qi = min(pi + _PART, i1)
+                        seen = _alike(sums, a, x0, y0, step, pi, qi, pj, qj)
+                        if seen == _NOTHING:
                             continue
-                        iu, iv = min(int(uu), cols - 2), min(int(vv), rows - 2)
-                        cell = np.int32(cells[iv, iu])
-                        if cell >= 16:
+                        if seen != _MIXED:
+                            more = one if seen == _LIT else np.int32(0)
+                            for j in range(pj, qj):
+                                for i in range(pi, qi):
+                                    count[k, j, i] += np.uint16(1)
+                                    total[k, j, i] += more
                             continue
-                        count[k, j, i] += np.uint16(1)
-                        if cell == 15:
-                            total[k, j, i] += one
-                        elif cell:
-                            fu, fv = np.float32(uu - iu), np.float32(vv - iv)
-                            p00, p01 = np.float32(cell & 1), np.float32((cell >> 1) & 1)
-                            p10, p11 = np.float32((cell >> 2) & 1), np.float32(cell >> 3)
-                            upper = p00 + fu * (p01 - p00)
-                            value = upper + fv * (p10 + fu * (p11 - p10) - upper)
-                            total[k, j, i] += np.int32(value * np.float32(_SCALE) + np.float32(0.5))
+                        for j in range(pj, qj):
+                            line_y = y0 + j * step
+                            u = a[0, 0] * x0 + a[0, 1] * line_y + a[0, 2]
+                            v = a[1, 0] * x0 + a[1, 1] * line_y + a[1, 2]
+                            for i in range(pi, qi):
+                                uu, vv = u + i * du, v + i * dv
+                                if uu < 0.0 or vv < 0.0 or uu > cols - 1 or vv > rows - 1:
+                                    continue
+                                iu, iv = min(int(uu), cols - 2), min(int(vv), rows - 2)
+                                cell = np.int32(cells[iv, iu])
+                                if cell >= 16:
+                                    continue
+                                count[k, j, i] += np.uint16(1)
+                                if cell == 15:
+                                    total[k, j, i] += one
+                                elif cell:
+                                    fu, fv = np.float32(uu - iu), np.float32(vv - iv)
+                                    p00, p01 = np.float32(cell & 1), np.float32((cell >> 1) & 1)
+                                    p10, p11 = np.float32((cell >> 2) & 1), np.float32(cell >> 3)
+                                    upper = p00 + fu * (p01 - p00)
+                                    value = upper + fv * (p10 + fu * (p11 - p10) - upper)
+                                    total[k, j, i] += np.int32(value * np.float32(_SCALE) + np.float32(0.5))
 
 
 def _threads(pool: ThreadPoolExecutor | None, work: Any, slices: int) -> None:
@@ -227,7 +268,9 @@ def _threads(pool: ThreadPoolExecutor | None, work: Any, slices: int) -> None:
         work(0, slices)
         return
     middle = slices // 2
-    list(pool.map(lambda ends: work(*ends), ((0, middle), (middle, slices))))
+    upper = pool.submit(work, middle, slices)
+    work(0, middle)
+    upper.result()
 
 
 @dataclass(frozen=True, eq=False)
