@@ -76,7 +76,11 @@ class RclpyMessages:
 
     def make(self, type_name: str, **fields: Any) -> Any:
         """Make a message; fields that are not given have their default value."""
-        return self.cls(type_name)(**fields)
+        large = fields.pop("data") if isinstance(fields.get("data"), array.array) else None
+        message = self.cls(type_name)(**fields)
+        if large is not None:
+            _hand_over(message, large)
+        return message
 
     def octets(self, data: NDArray[Any]) -> array.array[int]:
         """Return an array's memory as ``array.array('B')``: rclpy copies an ndarray 1000 times slower."""
@@ -92,6 +96,19 @@ class RclpyMessages:
     def octet(self, value: int) -> bytes:
         """Return a ``byte`` as rclpy wants it: a bytes object of length one."""
         return bytes([value])
+
+
+def _hand_over(message: Any, data: array.array[int]) -> None:
+    """Set a message's `data` without a copy.
+
+    Constructor and setter that ROS 2 generates (Jazzy) each make one, unless the setter checks its value.
+    """
+    unchecked = getattr(message, "_check_fields", None) is False
+    if unchecked:
+        message._check_fields = True
+    message.data = data
+    if unchecked:
+        message._check_fields = False
 
 
 class RosbagsMessages:

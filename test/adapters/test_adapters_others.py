@@ -400,6 +400,17 @@ def test_any_reason_and_any_counts_survive(reason, counts):
 # --- the two worlds
 
 
+@pytest.mark.parametrize("type_name", ["sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2"])
+def test_pixels_go_into_a_message_without_a_copy(type_name):
+    pytest.importorskip("rclpy")
+    factory = RclpyMessages()
+    data = factory.octets(np.arange(7, dtype=np.uint8))
+    message = factory.make(type_name, data=data, height=1)
+    assert message.data is data
+    assert (message.height, list(message.data)) == (1, list(range(7)))
+    assert factory.make(type_name, data=data)._check_fields == factory.make(type_name)._check_fields
+
+
 def test_messages_of_both_worlds_tell_their_type(factory):
     for name in ("sensor_msgs/msg/Image", "diagnostic_msgs/msg/DiagnosticArray"):
         assert type_name_of(factory.make(name)) == name
