@@ -181,6 +181,24 @@ def typestore() -> Any:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
+def message_from_cdr(cdr: bytes | memoryview, type_name: str, where: str) -> Any:
+    """Deserialise to a rosbags message, whose arrays are views of the bytes: nothing is copied.
+
+    Raises
+    ------
+    KeyError
+        If the type is unknown.
+    AdapterError
+        If the bytes are no message of it.
+    """
+    from rosbags.serde import SerdeError
+
+    try:
+        return typestore().deserialize_cdr(cdr, type_name)
+    except (SerdeError, AssertionError, IndexError, OverflowError, MemoryError) as error:
+        raise AdapterError(f"{where} is no {type_name}: {error or 'too short'}") from error
+
+
 def type_name_of(msg: Any) -> str:
     """Return ``package/msg/Name`` of a message of either world.
 

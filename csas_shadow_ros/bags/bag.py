@@ -17,7 +17,7 @@ from rosbags.rosbag2 import ReaderError
 from rosbags.serde import SerdeError
 
 from csas_shadow_ros.core.errors import AdapterError, BagError
-from msg_adapters.messages import stamp_to_ns, type_name_of, typestore
+from msg_adapters.messages import message_from_cdr, stamp_to_ns, type_name_of, typestore
 from msg_adapters.topics import NAMESPACE, TOPICS, absolute_name, clean_namespace
 
 from .mcap_file import McapFile, TopicType
@@ -57,13 +57,11 @@ class BagMessage(NamedTuple):
             If the type is unknown or the bytes are no message of it.
         """
         try:
-            return typestore().deserialize_cdr(self.cdr, self.type_name)
+            return message_from_cdr(self.cdr, self.type_name, f"{self.topic} message {self.number}")
         except KeyError:
             raise BagError(f"{self.topic}: type {self.type_name!r} is unknown; cannot decode it") from None
-        except (SerdeError, AssertionError, IndexError, OverflowError, MemoryError) as error:
-            raise BagError(
-                f"{self.topic} message {self.number} is no {self.type_name}: {error or 'too short'}"
-            ) from error
+        except AdapterError as error:
+            raise BagError(str(error)) from error
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,7 @@ from msg_adapters import (
     ViewProgress,
     diagnostics_to_msg,
     is_routine_report,
+    message_from_cdr,
     progress_from_msg,
     progress_to_msg,
     stamp_to_ns,
@@ -574,9 +575,14 @@ class Inlet:
         self._pairer = Pairer(kind.image_topic, capacity=qos.MAX_WINDOW)
         self._last_s = time.monotonic()
         self._seen: dict[int, None] = {}
-        node.subscribe(kind.image_topic, qos.VIEWS, lambda msg: self._take(msg, is_info=False))
+        # Raw: of a message that rclpy decodes the pixels are copied twice more.
+        node.subscribe(kind.image_topic, qos.VIEWS, self._take_image, raw=True)
         node.subscribe(kind.info_topic, qos.VIEWS, lambda msg: self._take(msg, is_info=True))
         node.inlets.append(self)
+
+    def _take_image(self, cdr: bytes) -> None:
+        topic = stream_of(self.stream).image_topic
+        self._take(message_from_cdr(cdr, TOPICS[topic].type_name, topic), is_info=False)
 
     def _take(self, msg: Any, *, is_info: bool) -> None:
         self._last_s = time.monotonic()

@@ -18,10 +18,12 @@ from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.core.target import Target, choose_target, find_target, spectrum_sign_evidence
 from csas_shadow_ros.core.warm import warm_sub_apertures
 from msg_adapters import (
+    TOPICS,
     Heartbeat,
     Pairer,
     TargetBox,
     coherent_image_from_msgs,
+    message_from_cdr,
     sector_from_msgs,
     stamp_to_ns,
     target_to_msg,
@@ -52,7 +54,8 @@ class SubApertureNode(CsasNode):
         self.target = self.publisher("target", qos.LATCHED)
         self.source = Source(self, "sub_aperture", self.send_view)
         self.pairer = Pairer("image", capacity=2)
-        self.subscribe_latched("image", lambda msg: self.take_image(msg, is_info=False))
+        # Raw, as views are: hundreds of megabytes are not to be copied in vain.
+        self.subscribe_latched("image", self.take_raw_image, raw=True)
         self.subscribe_latched("camera_info", lambda msg: self.take_image(msg, is_info=True))
         self.subscribe_latched("track", self.take_track)
         self.sector_inlet = Inlet(self, "sector", "sink", self.take_sector)
@@ -117,6 +120,10 @@ class SubApertureNode(CsasNode):
         return state | {"arc_deg": round(math.degrees(arcs.covered_rad)), "revision": self.stream.revision}
 
     # Inputs
+
+    def take_raw_image(self, cdr: bytes) -> None:
+        """Take the image as it was serialised."""
+        self.take_image(message_from_cdr(cdr, TOPICS["image"].type_name, "image"), is_info=False)
 
     def take_image(self, msg: Any, *, is_info: bool) -> None:
         """Take the image or its camera_info; the same one comes again when a player restarts."""
