@@ -67,7 +67,7 @@ _LOG_EVERY_S = 10.0
 _MAX_KINDS = 32
 _LONELY_S = 5.0
 #: How often it is looked who publishes latched topics: sooner than a large image is through.
-_DURABILITY_S = 0.05
+_DURABILITY_S, _WHO_S = 0.05, 1.0
 
 
 def kind_of(reason: str) -> str:
@@ -515,14 +515,16 @@ class Unlatched:
         self._topic = topic
         self._subscribe = subscribe
         self._publishers = 0
+        self._asked_s = time.monotonic()
         self.subscription: Subscription | None = subscribe()
 
     def look(self) -> None:
         """Subscribe, or take the subscription back, as publishers have come and gone."""
-        count = self._node.count_publishers(self._topic)
-        if count == self._publishers:
+        count, now = self._node.count_publishers(self._topic), time.monotonic()
+        # Who they are takes longer to ask than how many; one may have taken another's place.
+        if count == self._publishers and now - self._asked_s < _WHO_S:
             return
-        self._publishers = count
+        self._publishers, self._asked_s = count, now
         name = self._node.resolve_topic_name(self._topic)
         publishers = self._node.get_publishers_info_by_topic(name)
         latching = [p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers]
