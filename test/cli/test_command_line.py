@@ -617,6 +617,8 @@ def test_replay_leaves_the_folder_that_run_leaves_with_the_same_grid(tiny_box_ba
 EARLY_INTERRUPT = """
 import os, signal, sys
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background is born without
+
 def find_spec(name, path=None, target=None):
     if name == "csas_shadow_ros.core.errors":
         os.kill(os.getpid(), signal.SIGINT)
