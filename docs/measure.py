@@ -11,7 +11,7 @@
 
 Every run is of the `standard` profile, seed 1, of 180 views (2° steps) but for
 `fast`, `search`, `weak` (seed 2, turned by 33°, 90 views) and `sizes` (the accuracy benchmark's three seeds
-and poses, and two more that nothing was chosen by; 120 views); IoU is
+and poses, and four more; 120 views); IoU is
 against the shadow hull, the voxels that perfect silhouettes would leave, where nothing else is said.
 """
 
@@ -469,6 +469,8 @@ POSES = {
     3: ((-0.2, 0.25), 71.0),
     4: ((0.1, 0.2), 17.0),
     5: ((-0.12, -0.22), 118.0),
+    6: ((0.22, -0.05), 52.0),
+    7: ((-0.07, 0.16), 143.0),
 }
 _BENCHMARK_SEEDS = (1, 2, 3)
 
