@@ -123,19 +123,13 @@ def segments_of(pid: int) -> set[Path]:
     return found
 
 
-def remove_segment(segment: Path) -> bool:
-    """Remove a segment that a killed process left; True if nobody owns it and it is gone."""
+def remove_segment(segment: Path) -> None:
+    """Remove a segment that a killed process left; one that is gone already, or is owned, stays as it is."""
     owner = segment.with_name(segment.name + _OWNER)
-    try:
-        with owner.open("rb") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            segment.unlink(missing_ok=True)
-            owner.unlink(missing_ok=True)
-    except FileNotFoundError:
-        return False  # its owner took it away itself
-    except OSError:
-        return False  # somebody owns it
-    return True
+    with contextlib.suppress(OSError), owner.open("rb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        segment.unlink(missing_ok=True)
+        owner.unlink(missing_ok=True)
 
 
 def graph_environment(domain_id: int, log_dir: Path) -> dict[str, str]:

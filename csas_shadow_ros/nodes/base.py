@@ -206,7 +206,6 @@ class CsasNode(LifecycleNode):
         """Subscribe to a latched topic, whether or not its publisher really latches it."""
         self.subscribe(topic, qos.LATCHED, callback, raw=raw)
         unlatched = Unlatched(self, topic, lambda: self.subscribe(topic, qos.UNLATCHED, callback, raw=raw))
-        self._owned.append((Unlatched.drop, unlatched))
         self.every(_DURABILITY_S, unlatched.look)
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
@@ -534,10 +533,6 @@ class Unlatched:
         elif not wanted and self.subscription is not None:
             self._node.unsubscribe(self.subscription)
             self.subscription = None
-
-    def drop(self) -> None:
-        """Forget the subscription: the node destroys it."""
-        self.subscription = None
 
 
 class Inlet:

@@ -60,21 +60,27 @@ def alive(pid: int) -> bool:
         return False
 
 
-def test_every_process_killed_once_in_mid_run_and_the_grid_and_the_recording_are_the_same(
-    run_bag: Path, reference: Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    order = ["shadow_enhancement", "voxel_carver", "sub_aperture", "shadow_likelihood"]
-    order += ["bag_recorder", "bag_player"]
-    graphs: list[Graph] = []
-    pids: list[int] = []
-    victims: list[str] = []
+@pytest.fixture
+def graphs(monkeypatch: pytest.MonkeyPatch) -> list[Graph]:
+    """The graphs that replays have started, the last one last."""
+    started: list[Graph] = []
 
     class Watched(Graph):
         def __enter__(self) -> Graph:
-            graphs.append(self)
+            started.append(self)
             return super().__enter__()
 
     monkeypatch.setattr(module, "Graph", Watched)
+    return started
+
+
+def test_every_process_killed_once_in_mid_run_and_the_grid_and_the_recording_are_the_same(
+    run_bag: Path, reference: Reference, tmp_path: Path, graphs: list[Graph]
+) -> None:
+    order = ["shadow_enhancement", "voxel_carver", "sub_aperture", "shadow_likelihood"]
+    order += ["bag_recorder", "bag_player"]
+    pids: list[int] = []
+    victims: list[str] = []
 
     def kill_as_it_goes(done: int, total: int) -> None:
         # One every few views; the recorder and the player too.
@@ -231,16 +237,8 @@ def test_a_recorder_that_is_interrupted_finishes_its_bag(tmp_path: Path) -> None
 
 
 def test_a_recorder_that_is_ended_in_mid_run_goes_on_with_its_bag(
-    run_bag: Path, reference: Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_bag: Path, reference: Reference, tmp_path: Path, graphs: list[Graph]
 ) -> None:
-    graphs: list[Graph] = []
-
-    class Watched(Graph):
-        def __enter__(self) -> Graph:
-            graphs.append(self)
-            return super().__enter__()
-
-    monkeypatch.setattr(module, "Graph", Watched)
     ended: list[int] = []
 
     def end_it(done: int, total: int) -> None:
