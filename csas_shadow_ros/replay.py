@@ -357,12 +357,13 @@ def replay(
                 raise ParameterError(
                     f"out_dir is {str(out)!r} ({error.strerror}); expected a folder that can be written to"
                 ) from None
+        domain = free_domain_id() if domain_id is None else domain_id
+        # First of all: what it has to load takes longest.
+        server = stack.enter_context(start_fork_server(domain, out / "log"))
         recording = None if record is False else out / "recording" if record is True else Path(record)
         chosen, target = _plan(bag, stage, p)
         plan = _node_plan(bag, chosen, p, target, rate, recording, composites, window, overrides or {})
         check(plan)
-        domain = free_domain_id() if domain_id is None else domain_id
-        server = stack.enter_context(start_fork_server(domain, out / "log"))
         graph = stack.enter_context(Graph(plan, domain, out / "log", max_restarts, server))
         with signals_deferred():
             watcher = _Watcher(graph, domain)

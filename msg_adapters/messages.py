@@ -194,7 +194,8 @@ def message_from_cdr(cdr: bytes | memoryview, type_name: str, where: str) -> Any
     from rosbags.serde import SerdeError
 
     try:
-        return typestore().deserialize_cdr(cdr, type_name)
+        # Of bytes rosbags would take a slice, which is a copy of them all.
+        return typestore().deserialize_cdr(memoryview(cdr), type_name)
     except (SerdeError, AssertionError, IndexError, OverflowError, MemoryError) as error:
         raise AdapterError(f"{where} is no {type_name}: {error or 'too short'}") from error
 

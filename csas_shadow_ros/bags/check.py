@@ -44,7 +44,7 @@ MIN_COVERAGE_RAD = math.radians(9.0)
 MAX_ZEROS = 0.01
 #: A view's sonar may be this fraction of its range away from the track at the view's stamp.
 SONAR_TOLERANCE = 0.02
-_MAX_FFT_SIDE = 2048
+_MAX_FFT_SIDE = 1024
 #: A stated aspect may be so far off from what the track has, beyond half a sector.
 _ASPECT_SLACK_RAD = math.radians(3.0)
 

@@ -292,6 +292,12 @@ class CsasNode(LifecycleNode):
         """Publish what became of a view."""
         self._reports.publish(progress_to_msg(self.messages, item))
 
+    def tell_now(self) -> None:
+        """Send the heartbeats at once: others wait for what has just changed."""
+        with self._beat_lock:
+            if self.active:
+                self._send_beats()
+
     def _send_beats(self, *, leaving: bool = False) -> None:
         voices: list[Inlet | Source] = [*self.inlets, *self.sources]
         for voice in voices:
@@ -692,6 +698,7 @@ class Source:
         self._make = make
         self._may_send = may_send or (lambda _: True)
         self._looked_s = 0.0
+        self._told: list[str] = []
         self._work = node.background(self._pump)
         node.subscribe("progress", qos.REPORTS, self._on_progress)
         node.every(0.05, self._pump)
@@ -728,6 +735,7 @@ class Source:
             if flow.acknowledged_by_transport and flow.in_flight and self._all_acked():
                 flow.transported()
                 self.wake()
+            self._tell_the_end()
             return
         try:
             self._make(stamp)
@@ -736,6 +744,13 @@ class Source:
             flow.refuse(stamp, str(error))
             self.refused(stamp, str(error))
         self.wake()
+
+    def _tell_the_end(self) -> None:
+        """Tell at once for whom the run is at its end: they wait for nothing else."""
+        ended = [] if self.flow.in_flight else list(self.flow.finished_for())
+        if ended != self._told:
+            self._told = ended
+            self.node.tell_now()
 
     def _all_acked(self) -> bool:
         instant = Duration(nanoseconds=1_000_000)
@@ -772,6 +787,8 @@ class Source:
 
     def beat(self, *, leaving: bool) -> Heartbeat:
         """Make the heartbeat: it tells the sinks for whom the run is at its end."""
+        # Also while the node computes, when nobody else would notice that somebody has come.
+        self.flow.meet(self.image.get_subscription_count())
         values = {"stream": self.stream}
         if leaving:
             values["leaving"] = "true"

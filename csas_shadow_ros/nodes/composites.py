@@ -69,11 +69,15 @@ class CompositesNode(CsasNode):
         """Finish once the source says that every view is here."""
         if beat.values.get("stream") == "sub_aperture":
             self.growing.source_says(self.inlet.instance in beat.values.get("finished_for", "").split())
+            self.tick()
 
     def tick(self) -> None:
         """Publish what has changed."""
+        before = self.growing.complete
         self.growing.period_s = 1.0 / self.parameters.publish_hz
         self.growing.tick(time.monotonic())
+        if self.growing.complete and not before:
+            self.tell_now()
 
     def wanted(self) -> bool:
         """Say whether anybody looks at unfinished images."""

@@ -6,6 +6,7 @@ can be tested with a clock that the test turns.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -21,6 +22,8 @@ _LAST = 99
 TRANSPORT = "transport"
 _LONGEST_BACKOFF_S = 20.0
 _FIRST_RESEND_S = 1.0
+#: A source that was busy reads for so long what it was told meanwhile before it sends anything.
+_CATCH_UP_S = 0.05
 
 
 def place_of(stream: str) -> int:
@@ -141,6 +144,7 @@ class Flow:
         self._progress_s = self._born_s = self._served_s = self._looked_s = self.clock()
         self._subscribers = 0
         self._met_s: float | None = None
+        self._back_s = -math.inf
 
     # What the source has
 
@@ -293,6 +297,7 @@ class Flow:
         deaf_s, self._looked_s = now - self._looked_s, now
         if deaf_s > 1.0:
             # The source itself was busy: what the others said meanwhile is still in its queue.
+            self._back_s = now
             for peer in self.peers.values():
                 peer.heard_s += deaf_s
         for peer in self.peers.values():
@@ -308,11 +313,15 @@ class Flow:
                 del self._gone[key]
                 self.notes.append(("warn", f"{key[0]} did not come back in {self.sink_wait_s:g} s; going on"))
         self._subscribers = subscribers
-        if self._met_s is None and (subscribers or self.peers):
-            self._met_s = now
+        self.meet(subscribers)
         if self.live() or subscribers:
             self._served_s = now
         self._choose_leaves()
+
+    def meet(self, subscribers: int) -> None:
+        """Note when somebody was there for the first time; another thread than the one that looks may."""
+        if self._met_s is None and (subscribers or self.peers):
+            self._met_s = self.clock()
 
     def _choose_leaves(self) -> None:
         """Say who are the last consumers, and what they lack."""
@@ -340,7 +349,8 @@ class Flow:
     def waiting_for(self) -> str:
         """Say what the source waits for before it sends anything; empty if for nothing."""
         now = self.clock()
-        if self._met_s is not None and now - self._met_s < self.settle_s:
+        new = self._met_s is not None and now - self._met_s < self.settle_s
+        if new or now - self._back_s < min(_CATCH_UP_S, self.settle_s):
             return "whoever else is there to be heard"
         if others := sorted({p.node for p in self.live() if not self._counts(p)}):
             return f"{', '.join(others)} to take the target"

@@ -117,6 +117,7 @@ class VoxelCarverNode(CsasNode):
         self.growing.period_s = 1.0 / self.parameters.publish_hz
         self.growing.tick(time.monotonic())
         if self.growing.complete and not before:
+            self.tell_now()
             views = len(self.carver.stamps) if self.carver else 0
             found = f"an object of {self.object_voxels} voxels" if self.object_voxels else "no object"
             self.get_logger().info(f"complete: {views} views, {found}; the result is published")

@@ -23,6 +23,7 @@ from msg_adapters import (
     is_routine_report,
     mesh_from_msg,
     mesh_to_msg,
+    message_from_cdr,
     progress_from_msg,
     progress_to_msg,
     target_from_msg,
@@ -33,6 +34,7 @@ from msg_adapters import (
     voxels_from_msg,
     voxels_to_msg,
 )
+from msg_adapters.messages import typestore
 
 # --- track
 
@@ -409,6 +411,15 @@ def test_pixels_go_into_a_message_without_a_copy(type_name):
     assert message.data is data
     assert (message.height, list(message.data)) == (1, list(range(7)))
     assert factory.make(type_name, data=data)._check_fields == factory.make(type_name)._check_fields
+
+
+def test_pixels_of_a_serialised_message_are_read_where_they_lie():
+    kind = "sensor_msgs/msg/Image"
+    image = RosbagsMessages().make(kind, data=np.arange(64, dtype=np.uint8), height=1)
+    cdr = bytes(typestore().serialize_cdr(image, kind))
+    message = message_from_cdr(cdr, kind, "image")
+    assert np.array_equal(message.data, image.data)
+    assert np.shares_memory(message.data, np.frombuffer(cdr, np.uint8))
 
 
 def test_messages_of_both_worlds_tell_their_type(factory):

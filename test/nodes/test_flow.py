@@ -375,11 +375,24 @@ def test_a_source_listens_before_it_sends_so_that_it_knows_who_reports_what() ->
     sink = Consumer(flow)
     for stamp in (1, 2, 3):
         sink.report(stamp)
-    clock.now += 1.1
-    sink.beat()
-    flow.look(subscribers=1)
+    wait(flow, clock, 1.1, sink)
     assert take_all(flow) == [4, 5, 6]
     assert not flow.acknowledged_by_transport
+
+
+def test_a_source_that_computed_meanwhile_reads_what_it_was_told_and_waits_no_longer() -> None:
+    flow, clock = make_flow(6, settle_s=1.0)
+    flow.look(subscribers=0)
+    clock.now += 0.5
+    flow.meet(subscribers=1)  # its heartbeats go on while it computes
+    clock.now += 3.0
+    flow.look(subscribers=1)
+    assert take_all(flow) == []
+    sink = Consumer(flow)
+    for stamp in (1, 2, 3):
+        sink.report(stamp)
+    wait(flow, clock, 0.25, sink)
+    assert take_all(flow) == [4, 5, 6]
 
 
 def test_a_sector_source_counts_only_those_who_take_sectors() -> None:
