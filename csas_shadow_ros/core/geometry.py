@@ -216,6 +216,11 @@ class GroundGrid:
         return left <= x_m <= right and bottom <= y_m <= top
 
 
+def _determinant(m: Sequence[Sequence[float]]) -> float:
+    (a, b, c), (d, e, f), (g, h, i) = m
+    return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+
+
 def shadow_matrix(sonar_m: ArrayLike) -> FloatArray:
     """Return the 3×4 matrix that casts a point (x, y, z, 1) along the ray from the sonar to z = 0.
 
@@ -263,8 +268,8 @@ class ShadowCamera:
         for name, n in (("rows", self.rows), ("cols", self.cols)):
             check_range(f"number of {name}", n, 2, 1 << 16, "pixels")
         left = p[:, :3]
-        scale = np.abs(left).max()
-        if scale == 0.0 or abs(np.linalg.det(left / scale)) < 1e-15:
+        scale = float(np.abs(left).max())
+        if scale == 0.0 or abs(_determinant((left / scale).tolist())) < 1e-15:
             raise GeometryError(f"P is singular: {p.tolist()}; expected A · shadow matrix of the sonar")
         object.__setattr__(self, "projection", p)
         sonar, ground = self._sonar, self._ground_to_pixel
@@ -274,7 +279,8 @@ class ShadowCamera:
         span = max(float(np.hypot(*sonar[:2])), 1.0)
         if np.abs(ground[2, :2]).max() * span > 1e-6:
             raise GeometryError("P does not map the seabed affinely to pixels (its A has a perspective row)")
-        det = float(np.linalg.det(ground[:2, :2]))
+        (a, b), (c, d) = ground[:2, :2].tolist()
+        det = a * d - b * c
         if det >= 0.0 or abs(det) < 1e-9 * row_scale**2:
             fault = "mirrors" if det > 0 else "flattens"
             raise GeometryError(
@@ -305,11 +311,18 @@ class ShadowCamera:
 
     @cached_property
     def _sonar(self) -> FloatArray:
-        return np.asarray(-np.linalg.solve(self.projection[:, :3], self.projection[:, 3]), dtype=np.float64)
+        # Cramer's rule: general solvers take longer to call than all else that a view's geometry needs.
+        a, b, c, d = self.projection.T.tolist()
+        det = _determinant((a, b, c))
+        return np.array([-_determinant(m) / det for m in ((d, b, c), (a, d, c), (a, b, d))])
 
     @cached_property
     def _ground_to_pixel(self) -> FloatArray:
-        a = self.projection[:, :3] @ np.linalg.inv(shadow_matrix(self._sonar)[:, :3])
+        # P's left part times the inverse of the shadow matrix's.
+        sx, sy, sz = self._sonar
+        a = self.projection[:, :3].copy()
+        a[:, :2] /= sz
+        a[:, 2] = -(a[:, 0] * sx + a[:, 1] * sy + a[:, 2])
         return np.asarray(a / a[2, 2], dtype=np.float64)
 
     @property
@@ -351,12 +364,17 @@ class ShadowCamera:
         K, R : ndarray, shape (3, 3)
             What ``CameraInfo.k`` and ``.r`` carry.
         """
-        from scipy.linalg import rq  # late: few ask for it
-
-        k, r = rq(self.projection[:, :3])
-        signs = np.diag(np.where(np.diag(k) < 0, -1.0, 1.0))
-        k, r = k @ signs, signs @ r
-        if np.linalg.det(r) < 0:
+        # Gram and Schmidt from the last row up; it is vertical, as A is affine.
+        left = self.projection[:, :3]
+        k, r = np.zeros((3, 3)), np.empty((3, 3))
+        for row in (2, 1, 0):
+            rest = left[row]
+            for of in range(2, row, -1):
+                k[row, of] = left[row] @ r[of]
+                rest = rest - k[row, of] * r[of]
+            k[row, row] = math.sqrt(rest @ rest)
+            r[row] = rest / k[row, row]
+        if _determinant(r.tolist()) < 0:
             r = -r
         return k / k[2, 2], r
 
