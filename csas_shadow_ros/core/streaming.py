@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
@@ -23,12 +24,14 @@ from .carving import Carver
 from .errors import GeometryError, NoTargetError, ViewError
 from .geometry import TWO_PI, CoherentImage, Track
 from .parameters import PipelineParameters, SubApertureParameters, TargetParameters
-from .pipeline import ProcessedView, process_view
 from .sector import Sector, unlike
 from .subaperture import Spectrum, SubApertures
 from .target import Target, choose_target, find_target, spectrum_sign_evidence
 from .threads import in_order
 from .volume import Volume, VoxelGrid
+
+if TYPE_CHECKING:
+    from .pipeline import ProcessedView
 
 #: Sectors share so much at their common edge that rounding leaves no bin to neither.
 _EDGE_RAD = 1e-4
@@ -503,6 +506,9 @@ class StreamedRun:
         return self._advance()
 
     def _advance(self) -> list[ProcessedView]:
+        # Late: whoever takes a `Stream` alone, as the node does that all others wait for, needs none of it.
+        from .pipeline import process_view
+
         stream, p = self.stream, self.parameters
         due = stream.update()
         target, sub_apertures = stream.target, stream.sub_apertures
