@@ -247,7 +247,7 @@ class _Watcher:
             self._subscribe(topic, self._qos.LATCHED, partial(self.latest.__setitem__, topic))
         end = time.monotonic() + timeout_s
         while not set(topics) <= set(self.latest) and time.monotonic() < end:
-            self.spin(0.05)
+            self.spin(0.01)
         return self.latest
 
     def close(self) -> None:
@@ -357,13 +357,12 @@ def replay(
                 raise ParameterError(
                     f"out_dir is {str(out)!r} ({error.strerror}); expected a folder that can be written to"
                 ) from None
-        domain = free_domain_id() if domain_id is None else domain_id
-        # First of all: what it has to load takes longest.
-        server = stack.enter_context(start_fork_server(domain, out / "log"))
         recording = None if record is False else out / "recording" if record is True else Path(record)
         chosen, target = _plan(bag, stage, p)
         plan = _node_plan(bag, chosen, p, target, rate, recording, composites, window, overrides or {})
         check(plan)
+        domain = free_domain_id() if domain_id is None else domain_id
+        server = stack.enter_context(start_fork_server(domain, out / "log"))
         graph = stack.enter_context(Graph(plan, domain, out / "log", max_restarts, server))
         with signals_deferred():
             watcher = _Watcher(graph, domain)
@@ -460,13 +459,19 @@ def _until_complete(
     tell: Callable[[str], None],
     stall_timeout_s: float,
 ) -> None:
+    # What the result takes is loaded while the nodes are, one after the other: later they need every core.
+    import trimesh  # noqa: F401
+
+    from .core import mesh, target, threshold  # noqa: F401
+
     source = "sub_aperture" if stage in ("image", "sector") else stage
     sender = "sub_aperture" if stage in ("image", "sector") else "bag_player"
-    told = 0
+    told, finished = 0, False
     state: object = None
     since = time.monotonic()
     while True:
-        watcher.spin(0.1)
+        # Once all views are through, the result is all that is waited for.
+        watcher.spin(0.02 if finished else 0.1)
         graph.watch()
         for line in graph.deaths[told:]:
             watcher.died(line.partition(" ")[0])
@@ -475,15 +480,10 @@ def _until_complete(
         for name, text in watcher.errors.items():
             raise _error_of(name, text)
         beat = watcher.beats.get((sender, source))
-        if beat is not None:
-            # What the result takes is loaded while the nodes wait for the image and look for the target:
-            # later they need every core.
-            import trimesh  # noqa: F401
-
-            from .core import mesh, target, threshold  # noqa: F401
         if beat is not None and beat.counts.get("total"):
             progress(beat.counts["done"], beat.counts["total"])
-        if beat is not None and beat.counts.get("finished") and _sinks_complete(graph, watcher):
+        finished = beat is not None and bool(beat.counts.get("finished"))
+        if beat is not None and finished and _sinks_complete(graph, watcher):
             progress(beat.counts["done"], beat.counts["total"])
             return
         names = ("in", "sent", "done", "views")
