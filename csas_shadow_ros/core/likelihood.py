@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from .errors import ViewError
 from .geometry import View
-from .local_means import LocalMeans
+from .local_means import LocalMeans, Spans, known_span
 from .parameters import LikelihoodParameters
 
 FloatImage = NDArray[np.float32]
@@ -99,6 +99,45 @@ def l_out(power: FloatImage, contrast: float) -> FloatImage:
     return out
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _l_out_of_known(
+    power: FloatImage,
+    known: NDArray[np.bool_],
+    echo: NDArray[np.bool_],
+    spans: Spans,
+    contrast: float,
+    out: FloatImage,
+) -> None:  # pragma: no cover
+    """Evaluate `l_out` of the known pixels that are no echo; NaN elsewhere.
+
+    The exponential is 2^n · 2^f with a polynomial for f in [-½, ½], as the compiler makes vectors of that but
+    not of a library's. It is right to 2e-7, and so is the library's, whose exponent is rounded as well.
+    """
+    c2 = np.float32(contrast * contrast)
+    scale = np.float32((1.0 - contrast * contrast) / math.log(2.0))
+    for v in range(power.shape[0]):
+        first, last = spans[v]
+        out[v, :first] = np.nan
+        out[v, last:] = np.nan
+        of, to = power[v, first:last], out[v, first:last]
+        here, bright = known[v, first:last], echo[v, first:last]
+        for i in range(last - first):
+            # Beyond 2^-126 nothing is left of it beside 1.
+            exponent = max(of[i] * scale, np.float32(-126.0))
+            n = np.int32(exponent - np.float32(0.5))
+            f = exponent - np.float32(n)
+            part = np.float32(1.5403530e-4) * f + np.float32(1.3333558e-3)
+            part = part * f + np.float32(9.6181291e-3)
+            part = part * f + np.float32(5.5504109e-2)
+            part = part * f + np.float32(2.4022651e-1)
+            part = part * f + np.float32(6.9314718e-1)
+            part = part * f + np.float32(1.0)
+            # A float32 whose exponent is n and whose fraction is zero.
+            power_of_two = np.int32((n + 127) << 23).view(np.float32)
+            inverse = np.float32(1.0) / (np.float32(1.0) + c2 * (part * power_of_two))
+            to[i] = inverse * inverse if here[i] and not bright[i] else np.float32(np.nan)
+
+
 def expected_l_out(contrast: float) -> tuple[float, float]:
     """Return the mean of l_out over Rayleigh shadow pixels and over Rayleigh seabed pixels."""
     # i²/(2σ²) is exponential: integrate over its quantiles.
@@ -107,18 +146,58 @@ def expected_l_out(contrast: float) -> tuple[float, float]:
     return float(shadow.mean()), float(l_out(power, contrast).mean())
 
 
+@numba.njit(cache=True, nogil=True)
+def _count_known(amplitude: FloatImage, enough: int) -> int:  # pragma: no cover
+    """Count known pixels, row by row until there are enough."""
+    count = 0
+    for v in range(amplitude.shape[0]):
+        for u in range(amplitude.shape[1]):
+            count += abs(amplitude[v, u]) < np.inf
+        if count >= enough:
+            break
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _whole_blocks(
+    amplitude: FloatImage,
+    blocks: tuple[int, int],
+    size: tuple[int, int],
+    tiles: FloatImage,
+    whole: NDArray[np.int64],
+) -> int:  # pragma: no cover
+    """Copy every other pixel of the blocks of which all of these are known; return how many blocks."""
+    found = 0
+    for block in range(blocks[0] * blocks[1]):
+        top, left = block // blocks[1] * size[0], block % blocks[1] * size[1]
+        tile = tiles[found]
+        n, known = 0, True
+        for v in range(top, top + size[0], 2):
+            for u in range(left, left + size[1], 2):
+                pixel = amplitude[v, u]
+                known &= abs(pixel) < np.inf
+                tile[n] = pixel
+                n += 1
+            if not known:
+                break
+        if known:
+            whole[found] = block
+            found += 1
+    return found
+
+
 def _block_medians(
     amplitude: FloatImage, block: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Median of each wholly known block, and the blocks' middles in [-1, 1]."""
     rows, cols = amplitude.shape
     n_v, n_u = max(rows // block, 1), max(cols // block, 1)
-    tiles = amplitude[: n_v * block, : n_u * block]
-    tiles = tiles.reshape(n_v, min(block, rows), n_u, min(block, cols))
+    height, width = min(block, rows), min(block, cols)
     # Neighbouring pixels hold the same speckle: every other one tells as much.
-    tiles = tiles[:, ::2, :, ::2].swapaxes(1, 2).reshape(n_v * n_u, -1)
-    whole = np.flatnonzero(np.isfinite(tiles.sum(axis=1)))
-    tiles = tiles[whole]
+    tiles = np.empty((n_v * n_u, -(-height // 2) * -(-width // 2)), np.float32)
+    whole = np.empty(n_v * n_u, np.int64)
+    found = _whole_blocks(amplitude, (n_v, n_u), (height, width), tiles, whole)
+    tiles, whole = tiles[:found], whole[:found]
     middle = tiles.shape[1] // 2
     medians = np.partition(tiles, middle, axis=1)[:, middle]
     v, u = np.divmod(whole, n_u)
@@ -168,7 +247,7 @@ def seabed_level(amplitude: FloatImage, background: str) -> FloatImage:
         If too few pixels are known, or the seabed is zero.
     """
     rows, cols = amplitude.shape
-    known = int(np.count_nonzero(np.isfinite(amplitude)))
+    known = _count_known(amplitude, _MIN_PIXELS)
     if known < _MIN_PIXELS:
         raise ViewError(
             f"view has {known} known pixels; expected at least {_MIN_PIXELS} to estimate its levels"
@@ -204,31 +283,58 @@ def seabed_level(amplitude: FloatImage, background: str) -> FloatImage:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _relative_power(
-    amplitude: FloatImage, lattice: FloatImage, power: FloatImage, known: NDArray[np.bool_], level: FloatImage
+    amplitude: FloatImage,
+    lattice: FloatImage,
+    power: FloatImage,
+    known: NDArray[np.bool_],
+    spans: Spans,
+    level: FloatImage,
 ) -> None:  # pragma: no cover
     """Work out (i/σ_r)²/2, σ_r from a lattice; 0 where unknown. `level` gets each eighth σ_r."""
     rows, cols = amplitude.shape
-    last = lattice.shape[0] - 1
-    place = (np.arange(cols) + 0.5) * last / cols
+    last_node = lattice.shape[0] - 1
+    place = (np.arange(cols) + 0.5) * last_node / cols
     node = place.astype(np.int32)
     part = (place - node).astype(np.float32)
-    line = np.empty(cols, np.float32)
+    begins = np.searchsorted(node, np.arange(last_node + 1))
+    nodes, line = np.empty(last_node + 1, np.float32), np.empty(cols, np.float32)
     for v in range(rows):
-        at = (v + 0.5) * last / rows
+        at = (v + 0.5) * last_node / rows
         i = int(at)
-        here = lattice[i] + np.float32(at - i) * (lattice[i + 1] - lattice[i])
+        for j in range(last_node + 1):
+            nodes[j] = lattice[i, j] + np.float32(at - i) * (lattice[i + 1, j] - lattice[i, j])
+        here = known[v]
         for u in range(cols):
-            j = node[u]
-            line[u] = here[j] + part[u] * (here[j + 1] - here[j])
+            here[u] = abs(amplitude[v, u]) < np.float32(np.inf)
+        first, last = known_span(known, v)
+        spans[v, 0], spans[v, 1] = first, last
+        if v % 8 == 0:
+            _interpolate(nodes, begins, part, 0, cols, line)
+            level[v // 8] = line[::8]
+        else:
+            _interpolate(nodes, begins, part, first, last, line)
+        power[v, :first] = np.float32(0.0)
+        power[v, last:] = np.float32(0.0)
         # Rows of their own: the compiler then makes vectors of what it does with them.
-        pixels, powers, here = amplitude[v], power[v], known[v]
-        for u in range(cols):
-            ratio = pixels[u] / line[u]
+        pixels, sigma = amplitude[v, first:last], line[first:last]
+        powers, here = power[v, first:last], known[v, first:last]
+        for u in range(last - first):
+            ratio = pixels[u] / sigma[u]
             value = np.float32(0.5) * ratio * ratio
             powers[u] = value if value < np.float32(np.inf) else np.float32(0.0)
             here[u] = value < np.float32(np.inf)
-        if v % 8 == 0:
-            level[v // 8] = line[::8]
+
+
+@numba.njit(cache=True, nogil=True)
+def _interpolate(
+    nodes: FloatImage, begins: NDArray[np.int64], part: FloatImage, first: int, last: int, line: FloatImage
+) -> None:  # pragma: no cover
+    """Interpolate columns `first` to `last`: those from `begins[j]` on lie by a part each beyond node j."""
+    for j in range(nodes.size - 1):
+        here, step = nodes[j], nodes[j + 1] - nodes[j]
+        begin, end = max(first, begins[j]), min(last, begins[j + 1])
+        for u in range(np.uintp(begin), np.uintp(max(begin, end))):
+            line[u] = here + part[u] * step
 
 
 def box_mean(power: FloatImage, known: NDArray[np.bool_], radius_px: tuple[int, int]) -> FloatImage:
@@ -270,11 +376,9 @@ def fit_contrast(local: LocalMeans, start_db: float) -> tuple[float, float] | No
     """
     contrast2 = 10.0 ** (start_db / 10.0)
     # A pixel is inside a shadow if all of its 5×5 neighbours are dark: if the brightest of them is.
-    brightest = cv2.dilate(local.mean((2, 2)), np.ones((5, 5), np.uint8))
     # Halfway between the two levels in dB; patches of 5×5 looks seldom cross it by chance. No threshold
     # that is asked for below lies higher than that of the least contrast.
-    inside = brightest < np.float32(min(contrast2, _MIN_CONTRAST2) ** -0.5)
-    levels, powers = brightest[inside], local.power[inside]
+    levels, powers = local.interiors(float(np.float32(min(contrast2, _MIN_CONTRAST2) ** -0.5)))
     count = 0
     for _ in range(3):
         interior = powers[levels < contrast2**-0.5]
@@ -308,9 +412,10 @@ def view_levels(view: View, parameters: LikelihoodParameters | None = None) -> L
         raise ViewError(f"shadow view has {amplitude.dtype} pixels; expected float32 amplitude")
     amplitude = np.ascontiguousarray(amplitude)
     power, known = np.empty(amplitude.shape, np.float32), np.empty(amplitude.shape, np.bool_)
+    spans = np.empty((amplitude.shape[0], 2), np.int32)
     seabed = np.empty(tuple(-(-n // 8) for n in amplitude.shape), np.float32)
-    _relative_power(amplitude, seabed_level(amplitude, p.background), power, known, seabed)
-    local = LocalMeans(power, known)
+    _relative_power(amplitude, seabed_level(amplitude, p.background), power, known, spans, seabed)
+    local = LocalMeans(power, known, spans)
     fit = fit_contrast(local, p.shadow_contrast_db) if p.shadow_level == "estimated" else None
     contrast, fraction = fit or (10.0 ** (p.shadow_contrast_db / 20.0), math.nan)
     return Levels(_median(seabed), contrast, fraction, fit is not None, local)
@@ -326,9 +431,8 @@ def echo_mask(local: LocalMeans, echo_db: float) -> NDArray[np.bool_]:
     echo_db : float
         Threshold over the seabed's mean power 2σ_r², dB.
     """
-    bright = local.over((1, 1), 10.0 ** (echo_db / 10.0))
-    # One pixel more: the flank of an echo's response is neither seabed nor shadow.
-    return cv2.dilate(bright.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
+    # With a pixel more around: the flank of an echo's response is neither seabed nor shadow.
+    return local.echoes(10.0 ** (echo_db / 10.0))
 
 
 def outside_likelihood(
@@ -363,8 +467,7 @@ def outside_likelihood(
         rows_m, cols_m = view.info.camera.spacing_m
         radius = round(p.smoothing_m / (2.0 * rows_m)), round(p.smoothing_m / (2.0 * cols_m))
         power = box_mean(power, levels.known, radius)
-    out = l_out(power, levels.contrast)
-    out[~levels.known] = np.nan
-    if p.echo_unknown:
-        out[levels.echoes(p.echo_db)] = np.nan
+    echo = levels.echoes(p.echo_db) if p.echo_unknown else np.zeros_like(levels.known)
+    out = np.empty_like(power)
+    _l_out_of_known(power, levels.known, echo, levels.local.spans, levels.contrast, out)
     return replace(view, pixels=out)

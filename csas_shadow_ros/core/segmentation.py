@@ -32,11 +32,18 @@ _HALF_CELLS = (1.8, 0.75)
 _MAX_RADIUS = 8
 #: The flank of a shadow without an echo before it (pixels).
 _FLANK_PX = 2
+#: An echo speaks for as many columns on either side.
+_BESIDE = 2
+#: How far around the target is looked at first (pixels), and how much farther down-range, where shadows lie.
+_MARGIN_PX = 16
+_LONGER = 8
 #: Smaller dark patches are speckle.
 _MIN_SHADOW_PIXELS = 25
 
 
-def dark_pixels(levels: Levels, info: ViewInfo) -> NDArray[np.bool_]:
+def dark_pixels(
+    levels: Levels, info: ViewInfo, rows: slice = slice(None), cols: slice = slice(None)
+) -> NDArray[np.bool_]:
     """Mark pixels whose local mean power belongs to shadow rather than to seabed.
 
     Parameters
@@ -45,15 +52,22 @@ def dark_pixels(levels: Levels, info: ViewInfo) -> NDArray[np.bool_]:
         The view relative to its seabed level.
     info : ViewInfo
         Its resolution sets the box that the mean is taken over.
+    rows, cols : slice
+        The part of the view to look at, without steps: all of it.
     """
     cells = zip(_HALF_CELLS, info.resolution_m, info.camera.spacing_m, strict=True)
-    rows, cols = (int(min(max(round(half * cell / pixel), 1), _MAX_RADIUS)) for half, cell, pixel in cells)
+    half = (int(min(max(round(half * cell / pixel), 1), _MAX_RADIUS)) for half, cell, pixel in cells)
+    radius = next(half), next(half)
     shadow_power = 1.0 / levels.contrast**2
-    dark = levels.local.under((rows, cols), shadow_power + _DARK * (1.0 - shadow_power))
     # A threshold below one half draws a straight edge across the box in by a known part of it: the far end
     # of the shadow, which tells the height, is put back.
-    dark = _drawn_down(dark, round((0.5 - _DARK) * (2 * rows + 1)))
-    return np.asarray(dark & levels.known)
+    down = round((0.5 - _DARK) * (2 * radius[0] + 1))
+    first, last, _ = rows.indices(levels.known.shape[0])
+    begin = max(0, first - down)
+    dark = levels.local.under(
+        radius, shadow_power + _DARK * (1.0 - shadow_power), slice(begin, last), cols
+    )
+    return np.asarray(_drawn_down(dark, down)[first - begin :] & levels.known[rows, cols])
 
 
 def _drawn_down(dark: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:
@@ -100,62 +114,99 @@ def segment_shadow(
     """
     p = parameters or LikelihoodParameters()
     levels = levels or view_levels(view, p)
-    shadow = _of_target(dark_pixels(levels, view.info), view, target_m, reach_m)
-    echo = levels.echoes(p.echo_db) if p.echo_unknown else np.zeros_like(shadow)
-    covered = _before_shadow(shadow, echo) if p.echo_unknown else echo
-    mask = np.empty(shadow.shape, np.uint8)
-    _compose(levels.known.ravel(), shadow.ravel(), echo.ravel(), covered.ravel(), mask.ravel())
+    echo = levels.echoes(p.echo_db) if p.echo_unknown else np.zeros_like(levels.known)
+    mask = np.empty(levels.known.shape, np.uint8)
+    _compose(levels.known.ravel(), echo.ravel(), mask.ravel())
+    shadow, (top, left) = _of_target(levels, view.info, target_m, reach_m)
+    if shadow.size:
+        # What is covered reaches up-range by no more than the shadow's length, and is told by echoes two
+        # columns beside it.
+        begin, before = max(0, top - len(shadow)), max(0, left - _BESIDE)
+        rows, cols = slice(begin, top + len(shadow)), slice(left, left + shadow.shape[1])
+        shadow = np.pad(shadow, ((top - begin, 0), (0, 0)))
+        covered = np.zeros_like(shadow)
+        if p.echo_unknown:
+            _before_shadow(shadow, echo[rows, before : cols.stop + _BESIDE], left - before, covered)
+        _add_shadow(shadow, covered, mask[rows, cols])
     return replace(view, pixels=mask)
 
 
 @numba.njit(cache=True, nogil=True)
 def _compose(
-    known: NDArray[np.bool_],
-    shadow: NDArray[np.bool_],
-    echo: NDArray[np.bool_],
-    covered: NDArray[np.bool_],
-    mask: NDArray[np.uint8],
+    known: NDArray[np.bool_], echo: NDArray[np.bool_], mask: NDArray[np.uint8]
 ) -> None:  # pragma: no cover
-    """Say of every pixel what it is."""
+    """Say of every pixel what it is where there is no shadow of the target."""
     outside, unknown = np.uint8(MASK_OUTSIDE), np.uint8(MASK_UNKNOWN)
-    dark, hidden = np.uint8(MASK_SHADOW), np.uint8(MASK_COVERED)
     for i in range(mask.size):
-        value = hidden if covered[i] else outside
-        value = unknown if echo[i] else value
-        value = dark if shadow[i] else value
-        mask[i] = value if known[i] else unknown
+        mask[i] = outside if known[i] & (not echo[i]) else unknown
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_shadow(
+    shadow: NDArray[np.bool_], covered: NDArray[np.bool_], mask: NDArray[np.uint8]
+) -> None:  # pragma: no cover
+    """Put known pixels of the target's shadow, and those that the target covers, into a part of a mask."""
+    for i in range(mask.shape[0]):
+        for j in range(mask.shape[1]):
+            if shadow[i, j]:
+                mask[i, j] = MASK_SHADOW
+            elif covered[i, j] and mask[i, j] == MASK_OUTSIDE:
+                mask[i, j] = MASK_COVERED
 
 
 def _of_target(
-    dark: NDArray[np.bool_], view: View, target_m: tuple[float, float], reach_m: float
-) -> NDArray[np.bool_]:
-    """Keep the dark patches that begin at the target."""
-    camera = view.info.camera
+    levels: Levels, info: ViewInfo, target_m: tuple[float, float], reach_m: float
+) -> tuple[NDArray[np.bool_], tuple[int, int]]:
+    """Find the dark patches that begin at the target: a part that just holds them, and where it begins."""
+    camera = info.camera
     u, v, _ = camera.ground_to_pixel @ np.array([target_m[0], target_m[1], 1.0])
     rows_m, cols_m = camera.spacing_m
     reach = reach_m or 0.1 * camera.cols * cols_m
     # A patch belongs to the target if any of it lies in the box that the target's near shadow must cross.
     top, bottom = v - reach / rows_m, v + (reach + reach / math.tan(camera.grazing_rad) / 4.0) / rows_m
     left, right = u - reach / cols_m, u + reach / cols_m
-    out = np.zeros(dark.shape, np.bool_)
-    _patches_in_box(
-        dark,
-        (max(0, int(top)), min(camera.rows, max(0, int(bottom) + 1))),
-        (max(0, int(left)), min(camera.cols, max(0, int(right) + 1))),
-        _MIN_SHADOW_PIXELS,
-        out,
-    )
-    return out
+    rows = max(0, int(top)), min(camera.rows, max(0, int(bottom) + 1))
+    cols = max(0, int(left)), min(camera.cols, max(0, int(right) + 1))
+    # Most of a view is far from the target. Where a patch leads out of the part looked at, more is.
+    margin = _MARGIN_PX
+    while True:
+        begin, end = max(0, rows[0] - margin), min(camera.rows, rows[1] + _LONGER * margin)
+        first, last = max(0, cols[0] - margin), min(camera.cols, cols[1] + margin)
+        dark = dark_pixels(levels, info, slice(begin, end), slice(first, last))
+        out = np.zeros(dark.shape, np.bool_)
+        open_sides = begin > 0, end < camera.rows, first > 0, last < camera.cols
+        found = _patches_in_box(
+            dark,
+            (rows[0] - begin, rows[1] - begin),
+            (cols[0] - first, cols[1] - first),
+            _MIN_SHADOW_PIXELS,
+            open_sides,
+            out,
+        )
+        if found[0] >= 0:
+            a, b, c, d = found
+            return out[a:b, c:d], (begin + a, first + c)
+        margin *= 2
 
 
 @numba.njit(cache=True, nogil=True)
 def _patches_in_box(
-    dark: NDArray[np.bool_], rows: tuple[int, int], cols: tuple[int, int], least: int, out: NDArray[np.bool_]
-) -> None:  # pragma: no cover
-    """Mark the dark patches (8-connected) of `least` pixels or more that reach into a box."""
+    dark: NDArray[np.bool_],
+    rows: tuple[int, int],
+    cols: tuple[int, int],
+    least: int,
+    open_sides: tuple[bool, bool, bool, bool],
+    out: NDArray[np.bool_],
+) -> tuple[int, int, int, int]:  # pragma: no cover
+    """Mark the dark patches (8-connected) of `least` pixels or more that reach into a box.
+
+    Returns between which rows and columns they lie, (0, 0, 0, 0) if there are none, and -1s if a patch leads
+    to a side (first and last row, first and last column) beyond which the view goes on.
+    """
     n_rows, n_cols = dark.shape
     seen = np.zeros(dark.shape, np.bool_)
     patch = np.empty((dark.size, 2), np.int32)
+    top, bottom, left, right = n_rows, 0, n_cols, 0
     for i in range(rows[0], rows[1]):
         for j in range(cols[0], cols[1]):
             if not dark[i, j] or seen[i, j]:
@@ -166,6 +217,13 @@ def _patches_in_box(
             while done < size:
                 a, b = patch[done, 0], patch[done, 1]
                 done += 1
+                if (
+                    (open_sides[0] and a == 0)
+                    or (open_sides[1] and a == n_rows - 1)
+                    or (open_sides[2] and b == 0)
+                    or (open_sides[3] and b == n_cols - 1)
+                ):
+                    return -1, -1, -1, -1
                 for c in range(max(0, a - 1), min(n_rows, a + 2)):
                     for d in range(max(0, b - 1), min(n_cols, b + 2)):
                         if dark[c, d] and not seen[c, d]:
@@ -174,7 +232,13 @@ def _patches_in_box(
                             size += 1
             if size >= least:
                 for k in range(size):
-                    out[patch[k, 0], patch[k, 1]] = True
+                    a, b = patch[k, 0], patch[k, 1]
+                    out[a, b] = True
+                    top, bottom = min(top, a), max(bottom, a + 1)
+                    left, right = min(left, b), max(right, b + 1)
+    if bottom <= top:
+        return 0, 0, 0, 0
+    return top, bottom, left, right
 
 
 @numba.njit(cache=True, nogil=True)
@@ -205,19 +269,21 @@ def _mark_before(
             starts[j] = -1
 
 
-def _before_shadow(shadow: NDArray[np.bool_], echo: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _before_shadow(
+    shadow: NDArray[np.bool_], echo: NDArray[np.bool_], beside: int, out: NDArray[np.bool_]
+) -> None:
     """Mark the pixels between the target's echo and its shadow: the target covers them.
 
     The shadow hides the seabed from the target's foot on. Between the foot and where the view turns
     dark lies the target's own echo: a bright edge towards the sonar, then often a top as faint as the
     seabed. In each column, up-range of each stretch of shadow, all from the farthest echo (no farther than
     the stretch is long) is left open; where no echo is seen, only the shadow's flank is.
+
+    The echoes are those of as many rows, and of `beside` columns more on the left.
     """
     # An edge that glitters has dark columns in it: its neighbours speak for them.
-    edge = cv2.dilate(echo.view(np.uint8), np.ones((1, 5), np.uint8)).view(bool)
-    unknown = np.zeros(shadow.shape, bool)
-    _mark_before(shadow, edge, _FLANK_PX, unknown)
-    return unknown
+    edge = cv2.dilate(echo.astype(np.uint8), np.ones((1, 2 * _BESIDE + 1), np.uint8)).view(bool)
+    _mark_before(shadow, edge[:, beside : beside + shadow.shape[1]], _FLANK_PX, out)
 
 
 def silhouette_found(mask: View) -> bool:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy import ndimage
 
 from csas_shadow_ros.core.local_means import LocalMeans
 
@@ -18,38 +19,83 @@ def box_by_box(power: np.ndarray, known: np.ndarray, radius: tuple[int, int]) ->
     return out
 
 
-@given(
-    st.integers(1, 24),
-    st.integers(1, 24),
-    st.tuples(st.integers(0, 9), st.integers(0, 9)),
-    st.floats(0.0, 1.0),
-    st.integers(0, 2**31),
-)
-def test_means_are_those_of_the_known_pixels_in_the_box(rows, cols, radius, share, seed):
-    rng = np.random.default_rng(seed)
+def grown(marks: np.ndarray, by: int) -> np.ndarray:
+    """Add all pixels within `by` rows and columns of the marked ones."""
+    return ndimage.maximum_filter(marks, 2 * by + 1, mode="constant", cval=False)
+
+
+@st.composite
+def views(draw):
+    rows, cols = draw(st.integers(1, 40)), draw(st.integers(1, 70))
+    rng = np.random.default_rng(draw(st.integers(0, 2**31)))
     power = rng.exponential(size=(rows, cols)).astype(np.float32)
-    known = rng.random((rows, cols)) < share
+    known = rng.random((rows, cols)) < draw(st.floats(0.0, 1.0))
+    # As in a view, most of what is unknown is beyond the ends of its rows; some rows hold nothing.
+    first, last = np.sort(rng.integers(-cols // 2, cols + cols // 2 + 1, (2, rows)), axis=0)
+    column = np.arange(cols)
+    known &= (column >= first[:, None]) & (column < last[:, None])
     power[~known] = 0.0
+    return power, known
+
+
+@given(views(), st.tuples(st.integers(0, 9), st.integers(0, 9)), st.floats(0.1, 2.0))
+def test_a_pixel_is_under_a_threshold_where_the_mean_in_its_box_is(view, radius, threshold):
+    power, known = view
     local = LocalMeans(power, known)
     expected = box_by_box(power, known, radius)
-    np.testing.assert_allclose(local.mean(radius), expected, rtol=1e-5)
     # On a threshold itself rounding decides.
-    threshold = 0.8
     sure = np.abs(expected - threshold) > 1e-6
     assert np.array_equal(local.under(radius, threshold)[sure], (known & (expected < threshold))[sure])
-    over = known & (expected > threshold)
-    assert np.array_equal(local.over(radius, threshold)[sure], over[sure])
     assert local.total_known == known.sum()
+
+
+@given(views(), st.tuples(st.integers(0, 9), st.integers(0, 9)), st.data())
+def test_a_part_of_a_view_is_marked_as_in_the_whole(view, radius, data):
+    local = LocalMeans(*view)
+    part = tuple(
+        slice(*sorted(data.draw(st.tuples(st.integers(0, n), st.integers(0, n))))) for n in view[0].shape
+    )
+    np.testing.assert_array_equal(local.under(radius, 0.8, *part), local.under(radius, 0.8)[part])
+
+
+@given(views(), st.floats(1.0, 3.0))
+def test_echoes_are_the_pixels_over_a_threshold_in_the_mean_and_their_neighbours(view, threshold):
+    power, known = view
+    mean = box_by_box(power, known, (1, 1))
+    assume(not (np.abs(mean - threshold) < 1e-6).any())
+    expected = grown(known & (mean > threshold), 1)
+    np.testing.assert_array_equal(LocalMeans(power, known).echoes(threshold), expected)
+
+
+@given(views(), st.floats(0.5, 2.0))
+def test_interiors_are_the_pixels_all_of_whose_neighbours_are_under_a_threshold(view, threshold):
+    power, known = view
+    mean = box_by_box(power, known, (2, 2))
+    assume(not (np.abs(mean - threshold) < 1e-6).any())
+    # Beyond the view's edge there is no neighbour; an unknown one is not known to be dark.
+    brightest = ndimage.maximum_filter(mean, 5, mode="constant", cval=-np.inf)
+    inside = brightest < threshold
+    levels, powers = LocalMeans(power, known).interiors(threshold)
+    np.testing.assert_allclose(levels, brightest[inside], rtol=1e-5)
+    np.testing.assert_array_equal(powers, power[inside])
 
 
 @pytest.mark.parametrize("glare", [1e9, 3e38])
 def test_a_glaring_pixel_changes_no_mean_that_does_not_hold_it(glare):
     power = np.random.default_rng(1).exponential(size=(80, 90)).astype(np.float32)
     known = np.ones(power.shape, bool)
-    clean = LocalMeans(power, known).mean((2, 2))
-    power[10, 12] = glare
-    local = LocalMeans(power, known)
-    far = np.ones(power.shape, bool)
+    clean = LocalMeans(power, known)
+    with_glare = power.copy()
+    with_glare[10, 12] = glare
+    local = LocalMeans(with_glare, known)
+    far = ~np.zeros(power.shape, bool)
     far[8:13, 10:15] = False
-    np.testing.assert_allclose(local.mean((2, 2))[far], clean[far], rtol=1e-5)
-    assert local.over((1, 1), 1e6)[9:12, 11:14].all()  # the highest echo threshold, 60 dB
+    mean = box_by_box(power, known, (2, 2))
+    for threshold in (0.5, 1.0, 2.0):
+        sure = far & (np.abs(mean - threshold) > 1e-6)
+        np.testing.assert_array_equal(
+            local.under((2, 2), threshold)[sure], clean.under((2, 2), threshold)[sure]
+        )
+    echoes = local.echoes(1e6)  # the highest echo threshold, 60 dB
+    assert echoes[8:13, 10:15].all()
+    assert echoes.sum() == 25

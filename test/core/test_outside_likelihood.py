@@ -266,3 +266,16 @@ def test_a_view_with_its_known_pixels_scattered_is_used_or_refused_for_what_it_l
         assert "is zero" not in str(error)  # noqa: PT017
     else:
         assert level == pytest.approx(1.0, rel=0.05)
+
+
+def test_the_likelihood_of_a_view_is_the_formula_of_its_known_pixels():
+    amplitude = speckle(4, 128)
+    amplitude[shadow_boxes(0.1, 128)] *= 0.1
+    amplitude[:, :9], amplitude[5, 40:50], amplitude[90:93, 70:73] = np.nan, np.inf, 30.0
+    view = make_view(amplitude)
+    levels = view_levels(view)
+    got = outside_likelihood(view, None, levels).pixels
+    told = levels.known & ~levels.echoes(LikelihoodParameters().echo_db)
+    assert not told[91, 71]
+    np.testing.assert_array_equal(np.isnan(got), ~told)
+    np.testing.assert_allclose(got[told], l_out(levels.power, levels.contrast)[told], atol=1e-6)
