@@ -12,6 +12,7 @@ oversampled transform this is band-limited interpolation to about 1e-3, at 16 ta
 
 from __future__ import annotations
 
+import cmath
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -35,7 +36,7 @@ from .geometry import (
     view_ground_to_pixel,
 )
 from .parameters import SubApertureParameters
-from .taps import interpolate_4x4
+from .taps import interpolate_four, interpolate_one
 
 #: Taps of the interpolation kernel along each axis.
 _TAPS = 4
@@ -159,11 +160,6 @@ def _kernel_table() -> NDArray[np.float32]:
     return np.asarray(np.i0(_kaiser_beta() * np.sqrt(inside)), dtype=np.float32)
 
 
-@lru_cache(maxsize=1)
-def _doubled_table() -> NDArray[np.float32]:
-    return np.repeat(_kernel_table(), 2, axis=1)
-
-
 @lru_cache(maxsize=64)
 def _kernel_inverse(half: int, size: int) -> NDArray[np.float32]:
     """Reciprocal of the kernel's Fourier transform at bins -half … +half of a transform of `size`."""
@@ -174,6 +170,24 @@ def _kernel_inverse(half: int, size: int) -> NDArray[np.float32]:
 
 
 @numba.njit(cache=True, nogil=True)
+def _half_size(
+    edge_low: float,
+    width: float,
+    band: tuple[float, float],
+    centre: tuple[int, int],
+    steps: tuple[float, float],
+) -> tuple[int, int]:  # pragma: no cover
+    """Return how many bins (rows, cols) a wedge reaches from its centre, by points along its two arcs."""
+    rows = cols = 0.0
+    for i in range(65):
+        angle = edge_low + i * (width / 64)
+        for k in band:
+            rows = max(rows, abs(-k * math.sin(angle) / steps[0] - centre[0]))
+            cols = max(cols, abs(k * math.cos(angle) / steps[1] - centre[1]))
+    return math.ceil(rows) + 1, math.ceil(cols) + 1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _cut_wedge(
     spectrum: NDArray[np.complex64],
     centre: tuple[int, int],
@@ -187,11 +201,16 @@ def _cut_wedge(
     weights_v: NDArray[np.float32],
     weights_u: NDArray[np.float32],
     factor: np.complex64,
-    out: NDArray[np.complex64],
-) -> None:  # pragma: no cover
-    """Copy a wedge of the spectrum, weighted, into `out` so that the carrier lands on bin 0."""
+    out_shape: tuple[int, int],
+    extended: NDArray[np.complex64],
+) -> tuple[int, int]:  # pragma: no cover
+    """Copy a wedge of the spectrum, weighted, so that the carrier lands on bin 0.
+
+    It goes to the first `out_shape` bins inside `extended`'s border, which are zero elsewhere. Returns how
+    many rows from row 0 on, and how many at the end, hold it (1 at least).
+    """
     rows, cols = spectrum.shape
-    out_rows, out_cols = out.shape
+    out_rows, out_cols = out_shape
     # The wedge is half-open, [θ - w/2, θ + w/2), so that neighbours share no bin and leave none out.
     cos_l, sin_l, cos_h, sin_h = (
         math.cos(edge_low),
@@ -200,26 +219,67 @@ def _cut_wedge(
         math.sin(edge_high),
     )
     low2, high2 = band[0] * band[0], band[1] * band[1]
-    tapered = taper.shape[0] > 1
-    for dv in range(-half[0], half[0] + 1):
+    ahead = behind = 1
+    for ov in range(out_rows):
+        line = extended[_BORDER + ov, _BORDER : _BORDER + out_cols]
+        line[:] = 0
+        dv = ov if ov <= half[0] else ov - out_rows
         ky = -(centre[0] + dv) * steps[0]
-        v = (centre[0] + dv) % rows
-        ov = dv % out_rows
-        for du in range(-half[1], half[1] + 1):
-            kx = (centre[1] + du) * steps[1]
-            k2 = kx * kx + ky * ky
-            if k2 < low2 or k2 > high2:
-                continue
-            from_low = cos_l * ky - sin_l * kx
-            if from_low < 0.0 or cos_h * ky - sin_h * kx >= 0.0 or cos_l * kx + sin_l * ky < 0.0:
-                continue
-            w = weights_v[dv + half[0]] * weights_u[du + half[1]]
-            if tapered:
-                position = math.asin(min(1.0, from_low / math.sqrt(k2))) / width * (taper.shape[0] - 1)
-                i = min(int(position), taper.shape[0] - 2)
-                f = position - i
-                w *= (1.0 - f) * taper[i] + f * taper[i + 1]
-            out[ov, du % out_cols] = spectrum[v, (centre[1] + du) % cols] * (factor * w)
+        if dv < -half[0] or ky * ky > high2:
+            continue
+        # A row's bins within both edges and the outer circle lie side by side: from `first` to `last`.
+        right = math.sqrt(high2 - ky * ky)
+        left = -right
+        for a, b in ((-sin_l, cos_l * ky), (sin_h, -cos_h * ky), (cos_l, sin_l * ky)):
+            if a > 0.0:
+                left = max(left, -b / a)
+            elif a < 0.0:
+                right = min(right, -b / a)
+        first = max(int(left / steps[1]) - 2 - centre[1], -half[1])
+        last = min(int(right / steps[1]) + 3 - centre[1], half[1] + 1)
+        # Rounding decides at the ends only: there the inequalities themselves are asked.
+        for end in range(2):
+            while first < last:
+                kx = (centre[1] + (last - 1 if end else first)) * steps[1]
+                if (
+                    cos_l * ky - sin_l * kx >= 0.0
+                    and cos_h * ky - sin_h * kx < 0.0
+                    and cos_l * kx + sin_l * ky >= 0.0
+                    and kx * kx + ky * ky <= high2
+                ):
+                    break
+                first, last = (first, last - 1) if end else (first + 1, last)
+        if first < last:
+            ahead, behind = max(ahead, dv + 1), max(behind, -dv)
+        # Both arrays may wrap within the row. Slices: without negative indices these are vector instructions.
+        source = spectrum[(centre[0] + dv) % rows]
+        by = factor * weights_v[dv + half[0]]
+        near, far = min(0, -centre[1]), max(0, -centre[1])
+        near, far = min(max(near, first), last), min(max(far, first), last)
+        for begin, end in ((first, near), (near, far), (far, last)):
+            n, at, to = end - begin, (centre[1] + begin) % cols, begin % out_cols
+            bins, places, w = source[at : at + n], line[to : to + n], weights_u[half[1] + begin :]
+            for i in range(n):
+                value = bins[i] * by
+                places[i] = complex(value.real * w[i], value.imag * w[i])
+            if taper.shape[0] > 1:
+                for i in range(n):
+                    kx = (centre[1] + begin + i) * steps[1]
+                    k2 = kx * kx + ky * ky
+                    if k2 >= low2:
+                        sine = (cos_l * ky - sin_l * kx) / math.sqrt(k2)
+                        position = math.asin(min(1.0, sine)) / width * (taper.shape[0] - 1)
+                        j = min(int(position), taper.shape[0] - 2)
+                        f = position - j
+                        places[i] *= np.float32((1.0 - f) * taper[j] + f * taper[j + 1])
+        # Inside the inner circle nothing is kept.
+        if ky * ky < low2:
+            reach = int(math.sqrt(low2 - ky * ky) / steps[1]) + 1
+            while reach >= 0 and (reach * steps[1]) ** 2 + ky * ky >= low2:
+                reach -= 1
+            for du in range(max(first, -reach - centre[1]), min(last, reach + 1 - centre[1])):
+                line[du % out_cols] = 0
+    return ahead, behind
 
 
 @numba.njit(cache=True, nogil=True)
@@ -242,7 +302,6 @@ def _span(slope: float, start: float, low: float, high: float, n: int) -> tuple[
 def _resample(
     box: NDArray[np.float32],
     table: NDArray[np.float32],
-    doubled: NDArray[np.float32],
     affine: NDArray[np.float64],
     limits: NDArray[np.float64],
     out: NDArray[np.float32],
@@ -250,37 +309,43 @@ def _resample(
     """Interpolate an image at an affine lattice; NaN outside `limits`.
 
     `box` is (rows, cols, 2) float32, extended by `_BORDER` samples of its period on every side;
-    `affine` maps (u, v) to its samples; `doubled` is `table` with every weight twice; `out` is
-    (n_v, n_u, 2) float32.
+    `affine` maps (u, v) to its samples; `out` is (n_v, n_u, 2) float32.
     """
     n_v, n_u = out.shape[:2]
-    stride = 2 * box.shape[1]
-    samples, down, across, pixels = box.ravel(), table.ravel(), doubled.ravel(), out.ravel()
+    samples, weights, pixels = box.ravel(), table.ravel(), out.ravel()
+    # Of 32 bits, as vector instructions convert to: enough for boxes of 2^30 samples.
+    stride, two, four, entries = np.int32(2 * box.shape[1]), np.int32(2), np.int32(4), np.int32(_TABLE)
+    starts, across, down = np.empty(n_u, np.int32), np.empty(n_u, np.int32), np.empty(n_u, np.int32)
     for v in range(n_v):
         x0 = affine[0, 1] * v + affine[0, 2]
         y0 = affine[1, 1] * v + affine[1, 2]
         a, b = _span(affine[0, 0], x0, limits[0], limits[1], n_u)
         c, d = _span(affine[1, 0], y0, limits[2], limits[3], n_u)
         first, last = max(a, c), max(min(b, d), max(a, c))
-        out[v, :first] = np.float32(np.nan)
-        out[v, last:] = np.float32(np.nan)
-        for u in range(first, last):
-            x = affine[0, 0] * u + x0
-            y = affine[1, 0] * u + y0
-            ix, iy = int(x), int(y)  # not negative: the border is in front
-            wx, wy = int((x - ix) * _TABLE + 0.5), int((y - iy) * _TABLE + 0.5)
-            at = (iy - 1) * stride + 2 * (ix - 1)
-            interpolate_4x4(samples, at, stride, across, 8 * wx, down, 4 * wy, pixels, 2 * (v * n_u + u))
+        line = 2 * v * n_u
+        pixels[line : line + 2 * first] = np.float32(np.nan)
+        pixels[line + 2 * last : line + 2 * n_u] = np.float32(np.nan)
+        # All positions first: without the interpolation they become vector instructions.
+        for i in range(last - first):
+            x = affine[0, 0] * (first + i) + x0
+            y = affine[1, 0] * (first + i) + y0
+            ix, iy = np.int32(x), np.int32(y)  # not negative: the border is in front
+            starts[i] = (iy - np.int32(1)) * stride + two * (ix - np.int32(1))
+            across[i] = four * (np.int32(x * _TABLE + 0.5) - entries * ix)
+            down[i] = four * (np.int32(y * _TABLE + 0.5) - entries * iy)
+        place, fours = line + 2 * first, (last - first) // 4 * 4
+        for i in range(0, fours, 4):
+            interpolate_four(samples, stride, weights, starts, across, down, i, pixels, place + 2 * i)
+        for i in range(fours, last - first):
+            interpolate_one(samples, stride, weights, starts, across, down, i, pixels, place + 2 * i)
 
 
-def _extended(box: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    """Extend an image by `_BORDER` samples of its period on every side."""
+def _extend(extended: NDArray[np.complex64], cols: int) -> None:
+    """Fill the border round an image of so many columns with `_BORDER` samples of its period."""
     n = _BORDER
-    out = np.empty((box.shape[0] + 2 * n, box.shape[1] + 2 * n), np.complex64)
-    rows = out[n:-n]
-    rows[:, n:-n], rows[:, :n], rows[:, -n:] = box, box[:, -n:], box[:, :n]
-    out[:n], out[-n:] = rows[-n:], rows[:n]
-    return out
+    rows = extended[n:-n]
+    rows[:, :n], rows[:, n + cols : 2 * n + cols] = rows[:, cols : n + cols], rows[:, n : 2 * n]
+    extended[:n], extended[-n:] = rows[-n:], rows[:n]
 
 
 class SubApertures:
@@ -399,37 +464,47 @@ class SubApertures:
         centre : (int, int)
             The carrier's bin (row, col).
         """
+        extended, (rows, cols), centre = self._extended_baseband(aspect_rad)
+        return extended[_BORDER : _BORDER + rows, _BORDER : _BORDER + cols], centre
+
+    def _extended_baseband(
+        self, aspect_rad: float
+    ) -> tuple[NDArray[np.complex64], tuple[int, int], tuple[int, int]]:
+        """Return the baseband image inside a border of its period, its shape, and the carrier's bin."""
         centre = self._carrier_bin(aspect_rad)
         steps = self.spectrum.step_rad_m
-        edges = self.wedge_edges(aspect_rad)
-        width = self.aperture_rad
-        angles = edges[0] + np.linspace(0.0, width, 65)
-        rim = np.concatenate([k * np.exp(1j * angles) for k in self.band])
-        half = (
-            math.ceil(float(np.abs(-rim.imag / steps[0] - centre[0]).max())) + 1,
-            math.ceil(float(np.abs(rim.real / steps[1] - centre[1]).max())) + 1,
-        )
-        shape = tuple(scipy.fft.next_fast_len(math.ceil(_OVERSAMPLING * (2 * h + 1))) for h in half)
+        low, high = self.wedge_edges(aspect_rad)
+        half = _half_size(low, self.aperture_rad, self.band, centre, steps)
+        rows, cols = (scipy.fft.next_fast_len(math.ceil(_OVERSAMPLING * (2 * h + 1))) for h in half)
         k = (centre[1] * steps[1], -centre[0] * steps[0])
         # The spectrum is referred to the image's corner; the contract's carrier to the scene's origin.
         corner = k[0] * self.grid.x_min_m + k[1] * self.grid.y_max_m
-        box = np.zeros(shape, np.complex64)
-        _cut_wedge(
+        stride = cols + 2 * _BORDER
+        # Rows a power of two apart would share a few lines of the cache.
+        extended = np.empty((rows + 2 * _BORDER, stride + 8 * (stride % 128 == 0)), np.complex64)
+        ahead, behind = _cut_wedge(
             self.spectrum.values,
             centre,
             half,
             steps,
-            edges[0],
-            edges[1],
+            low,
+            high,
             self.band,
             self._taper,
-            width,
-            _kernel_inverse(half[0], shape[0]),
-            _kernel_inverse(half[1], shape[1]),
-            np.complex64(np.exp(-1j * corner)),
-            box,
+            self.aperture_rad,
+            _kernel_inverse(half[0], rows),
+            _kernel_inverse(half[1], cols),
+            np.complex64(cmath.exp(-1j * corner)),
+            (rows, cols),
+            extended,
         )
-        return ducc0.fft.c2c(box, forward=False, out=box, nthreads=1), centre
+        box = extended[_BORDER:-_BORDER, _BORDER : _BORDER + cols]
+        # Rows first: only the wedge's are not zero.
+        for part in (box[:ahead], box[rows - behind :]):
+            ducc0.fft.c2c(part, axes=(1,), forward=False, out=part, nthreads=1)
+        ducc0.fft.c2c(box, axes=(0,), forward=False, out=box, nthreads=1)
+        _extend(extended, cols)
+        return extended, (rows, cols), centre
 
     def view_of_aspect(self, aspect_rad: float) -> View:
         """Make the view of any aspect.
@@ -450,21 +525,19 @@ class SubApertures:
             If the track has a gap there.
         """
         info = self.info(aspect_rad)
-        box, _ = self.baseband(aspect_rad)
+        extended, shape, _ = self._extended_baseband(aspect_rad)
         # View pixel → ground → image pixel → sample of the small image.
         affine = (self.grid.ground_to_pixel @ info.camera.pixel_to_ground)[:2]
-        scale = np.array(box.shape[::-1]) / np.array(self.spectrum.values.shape[::-1])
+        scale = np.array(shape[::-1]) / np.array(self.spectrum.values.shape[::-1])
         affine = affine * scale[:, None]
         affine[:, 2] += _BORDER
         # The image reaches half a pixel beyond the centres of its outer pixels.
         last = np.array([self.grid.cols, self.grid.rows]) - 0.5
         limits = np.column_stack([-0.5 * scale, last * scale]).ravel() + _BORDER
-        extended = _extended(box)
         pixels = np.empty(info.camera.shape, np.complex64)
         _resample(
             extended.view(np.float32).reshape(*extended.shape, 2),
             _kernel_table(),
-            _doubled_table(),
             affine,
             limits,
             pixels.view(np.float32).reshape(*pixels.shape, 2),
