@@ -21,6 +21,8 @@ from .parameters import ShadowParameters
 
 #: Rows after which a running product of phases starts anew: its rounding stays under 1e-5.
 _RUN = 32
+#: Between these a power of single precision has kept its digits, and an amplitude has no need of more.
+_LEAST, _MOST = np.float32(1e-30), np.float32(1e37)
 
 
 def focus_range(info: ViewInfo, target_m: tuple[float, float]) -> float:
@@ -56,76 +58,111 @@ def focus_phase_rate(
 def _apply_phase(
     rows: NDArray[np.complex64], first_m: float, step_m: float, rate: NDArray[np.float64]
 ) -> None:  # pragma: no cover
-    """Multiply row i by exp(j (first + i step) rate), as a running product that starts anew now and then."""
+    """Multiply row i by exp(j (first + i step) rate), as running products.
+
+    That of every row is of single precision and starts anew from one of double precision now and then.
+    """
     n, length = rows.shape
     turn, by = np.empty(length, np.complex64), np.empty(length, np.complex64)
+    start, run = np.empty(length, np.complex128), np.empty(length, np.complex128)
     for k in range(length):
+        start[k] = complex(math.cos(first_m * rate[k]), math.sin(first_m * rate[k]))
         by[k] = complex(math.cos(step_m * rate[k]), math.sin(step_m * rate[k]))
+        run[k] = complex(math.cos(_RUN * step_m * rate[k]), math.sin(_RUN * step_m * rate[k]))
     for i in range(n):
         if i % _RUN == 0:
-            delta = first_m + i * step_m
             for k in range(length):
-                turn[k] = complex(math.cos(delta * rate[k]), math.sin(delta * rate[k]))
+                turn[k] = start[k]
+                start[k] *= run[k]
         for k in range(length):
             rows[i, k] *= turn[k]
             turn[k] *= by[k]
 
 
 @numba.njit(cache=True, nogil=True)
-def _known_pixels(
-    pixels: NDArray[np.complex64], first: int, known: NDArray[np.bool_], rows: NDArray[np.complex64]
-) -> None:  # pragma: no cover
-    """Mark the finite pixels; copy the rows from `first` on, zero where unknown and beyond their end."""
-    n, cols = pixels.shape
-    for i in range(n):
-        for j in range(cols):
-            pixel = pixels[i, j]
-            finite = (abs(pixel.real) < np.inf) & (abs(pixel.imag) < np.inf)
-            known[i, j] = finite
-            if i >= first:
-                rows[i - first, j] = pixel if finite else np.complex64(0)
-        if i >= first:
-            rows[i - first, cols:] = np.complex64(0)
+def _finite(line: NDArray[np.float32], j: int) -> bool:  # pragma: no cover
+    """Say whether pixel j of a row, real and imaginary parts in turns, is finite."""
+    return bool(abs(line[2 * j]) < np.inf and abs(line[2 * j + 1]) < np.inf)
 
 
 @numba.njit(cache=True, nogil=True)
-def _shrink_rows(known: NDArray[np.bool_], margins: NDArray[np.int64]) -> None:  # pragma: no cover
-    """Drop `margins[i]` pixels from both ends of each row's known interval (and all beyond)."""
-    cols = known.shape[1]
-    for i in range(known.shape[0]):
-        first, last = cols, -1
-        for j in range(cols):
-            if known[i, j]:
-                first = min(first, j)
-                last = j
-        for j in range(cols):
-            if j < first + margins[i] or j > last - margins[i]:
-                known[i, j] = False
+def _known_pixels(
+    pixels: NDArray[np.float32], first: int, ends: NDArray[np.int64], rows: NDArray[np.float32]
+) -> int:  # pragma: no cover
+    """Find where each row's finite pixels begin and end; copy the rows from `first` on.
+
+    A copy is zero where nothing is known, and beyond the row's end. Returns the row behind the last that has
+    a finite pixel.
+    """
+    behind = 0
+    for i in range(len(pixels)):
+        line = pixels[i]
+        begin, end = 0, len(line) // 2
+        while begin < end and not _finite(line, begin):
+            begin += 1
+        while begin < end and not _finite(line, end - 1):
+            end -= 1
+        ends[i, 0], ends[i, 1] = begin, end
+        if begin < end:
+            behind = i + 1
+        if i < first:
+            continue
+        copy = rows[i - first]
+        copy[: 2 * begin], copy[2 * end :] = 0.0, 0.0
+        here, there = line[2 * begin : 2 * end], copy[2 * begin : 2 * end]
+        holes = 0
+        for k in range(len(there)):
+            there[k] = here[k]
+            holes += not abs(here[k]) < np.inf
+        if holes:
+            for j in range(end - begin):
+                if not _finite(here, j):
+                    there[2 * j] = there[2 * j + 1] = 0.0
+    return behind
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _known_amplitudes(
-    parts: NDArray[np.float32], known: NDArray[np.bool_], out: NDArray[np.float32]
+    pixels: NDArray[np.float32],
+    first: int,
+    ends: NDArray[np.int64],
+    rows: NDArray[np.float32],
+    out: NDArray[np.float32],
 ) -> None:  # pragma: no cover
-    """Take the amplitudes of known pixels; NaN where unknown. `parts` may have longer rows than `out`."""
-    rows, cols = out.shape
-    for i in range(rows):
-        line, here, to = parts[i], known[i], out[i]
-        for j in range(cols):
-            # In double precision: a square of float32 overflows at 2e19.
-            re, im = np.float64(line[2 * j]), np.float64(line[2 * j + 1])
-            to[j] = np.float32(math.sqrt(re * re + im * im)) if here[j] else np.float32(np.nan)
+    """Take the amplitudes, from row `first` on those of `rows`; NaN where a pixel is not known."""
+    for i in range(len(out)):
+        begin, end = ends[i, 0], max(ends[i, 0], ends[i, 1])
+        out[i, :begin], out[i, end:] = np.float32(np.nan), np.float32(np.nan)
+        here, to = pixels[i, 2 * begin : 2 * end], out[i, begin:end]
+        line = rows[i - first, 2 * begin : 2 * end] if i >= first and begin < end else here
+        doubtful = np.int32(0)
+        for j in range(len(to)):
+            re, im = line[2 * j], line[2 * j + 1]
+            # A difference of what is not finite is NaN.
+            unknown = (here[2 * j] - here[2 * j]) + (here[2 * j + 1] - here[2 * j + 1])
+            power = re * re + im * im + unknown
+            to[j] = math.sqrt(power)
+            doubtful = np.int32(doubtful + (not (power > _LEAST) & (power < _MOST)))
+        if doubtful:
+            # In double precision: a square of float32 overflows at 2e19, and vanishes below 1e-19.
+            for j in range(len(to)):
+                re, im = np.float64(line[2 * j]), np.float64(line[2 * j + 1])
+                amplitude = np.float32(math.sqrt(re * re + im * im))
+                to[j] = amplitude if _finite(here, j) else np.float32(np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class _Focused:
-    """A focused view in parts: up to row `first` its pixels are the view's own, from there on `rows`."""
+    """A focused view in parts: up to row `first` its pixels are the view's own, from there on `rows`.
+
+    Row i is known from column `ends[i, 0]` to `ends[i, 1]`, where the view's own pixels are finite.
+    """
 
     info: ViewInfo
     pixels: NDArray[np.complex64]
     first: int
     rows: NDArray[np.complex64]
-    known: NDArray[np.bool_]
+    ends: NDArray[np.int64]
 
 
 def _focus(view: View, target_m: tuple[float, float], parameters: ShadowParameters | None) -> _Focused:
@@ -144,22 +181,22 @@ def _focus(view: View, target_m: tuple[float, float], parameters: ShadowParamete
     reach = np.ceil(behind * math.tan(info.aperture_rad / 2.0) / spacing).astype(np.int64)
     # What leaves the view on one side must not come back on the other.
     length = scipy.fft.next_fast_len(cols + int(min(reach.max(initial=0), cols)))
-    known = np.empty(pixels.shape, np.bool_)
+    ends = np.empty((n_rows, 2), np.int64)
     rows = np.empty((len(behind), length), np.complex64)
-    _known_pixels(pixels, first, known, rows)
-    if not known.any():
+    last = _known_pixels(_parts(pixels), first, ends, _parts(rows))
+    if not last:
         raise ViewError("sub-aperture view holds no finite pixel")
-    if len(behind):
+    rows = rows[: max(last - first, 0)]
+    if len(rows):
         carrier = float(cross_range_axis(info.aspect_rad) @ np.asarray(info.carrier_rad_m))
         k_c = 2.0 * math.pi * scipy.fft.fftfreq(length, spacing) + carrier
         rate = focus_phase_rate(k_c, info, p.enhancement)
         ducc0.fft.c2c(rows, axes=(1,), out=rows, nthreads=1)
         _apply_phase(rows, float(behind[0]), float(offsets[-1] - offsets[0]) / (n_rows - 1), rate)
         ducc0.fft.c2c(rows, axes=(1,), forward=False, inorm=2, out=rows, nthreads=1)
-        margins = np.zeros(n_rows, np.int64)
-        margins[first:] = reach
-        _shrink_rows(known, margins)
-    return _Focused(replace(info, focus_range_m=r0), pixels, first, rows, known)
+        ends[first:, 0] += reach
+        ends[first:, 1] -= reach
+    return _Focused(replace(info, focus_range_m=r0), pixels, first, rows, ends)
 
 
 def focus(view: View, target_m: tuple[float, float], parameters: ShadowParameters | None = None) -> View:
@@ -193,8 +230,10 @@ def focus(view: View, target_m: tuple[float, float], parameters: ShadowParameter
     """
     f = _focus(view, target_m, parameters)
     pixels = f.pixels.copy()
-    pixels[f.first :] = f.rows[:, : pixels.shape[1]]
-    pixels[~f.known] = np.complex64(complex(math.nan, math.nan))
+    pixels[f.first : f.first + len(f.rows)] = f.rows[:, : pixels.shape[1]]
+    column = np.arange(pixels.shape[1])
+    known = np.isfinite(f.pixels) & (column >= f.ends[:, :1]) & (column < f.ends[:, 1:])
+    pixels[~known] = np.complex64(complex(math.nan, math.nan))
     return View(f.info, pixels)
 
 
@@ -213,8 +252,7 @@ def enhance(view: View, target_m: tuple[float, float], parameters: ShadowParamet
     """
     f = _focus(view, target_m, parameters)
     amplitude = np.empty(f.pixels.shape, np.float32)
-    _known_amplitudes(_parts(f.pixels[: f.first]), f.known[: f.first], amplitude[: f.first])
-    _known_amplitudes(_parts(f.rows), f.known[f.first :], amplitude[f.first :])
+    _known_amplitudes(_parts(f.pixels), f.first, f.ends, _parts(f.rows), amplitude)
     return View(f.info, amplitude)
 
 

@@ -101,6 +101,26 @@ def test_an_enhanced_view_keeps_its_stamp_and_geometry_and_tells_its_focus():
     assert (shadow.pixels[np.isfinite(shadow.pixels)] >= 0).all()
 
 
+@pytest.mark.parametrize("scale", [1e-25, 1e25])
+def test_amplitudes_whose_squares_single_precision_does_not_hold_are_right_too(scale):
+    view, _, _ = view_and_reference(1, 33.0)
+    scaled = replace(view, pixels=view.pixels * np.float32(scale))
+    expected = enhance(view, TARGET).pixels * np.float32(scale)
+    np.testing.assert_allclose(enhance(scaled, TARGET).pixels, expected, rtol=1e-4, atol=1e-6 * scale)
+
+
+def test_a_pixel_that_is_not_finite_is_unknown_and_counts_as_zero_in_its_row():
+    view, _, _ = view_and_reference(1, 33.0)
+    row, col = len(view.pixels) * 2 // 3, len(view.pixels) // 2
+    assert view.info.down_range_of_rows()[row] > focus_range(view.info, TARGET)
+    zero, holes = view.pixels.copy(), view.pixels.copy()
+    zero[row, col : col + 2] = 0.0
+    holes[row, col : col + 2] = complex(math.nan, 1.0), complex(1.0, math.inf)
+    expected = enhance(replace(view, pixels=zero), TARGET).pixels
+    expected[row, col : col + 2] = math.nan
+    np.testing.assert_allclose(enhance(replace(view, pixels=holes), TARGET).pixels, expected, rtol=1e-6)
+
+
 def test_enhancement_leaves_the_view_that_it_was_given_alone():
     view, _, _ = view_and_reference(1, 45.0)
     before = view.pixels.copy()
