@@ -32,7 +32,6 @@ from .geometry import (
     View,
     ViewInfo,
     aspects_of_step,
-    unit_to_sonar,
     view_ground_to_pixel,
 )
 from .parameters import SubApertureParameters
@@ -303,18 +302,18 @@ def _resample(
     box: NDArray[np.float32],
     table: NDArray[np.float32],
     affine: NDArray[np.float64],
-    limits: NDArray[np.float64],
+    limits: tuple[float, float, float, float],
     out: NDArray[np.float32],
 ) -> None:  # pragma: no cover
     """Interpolate an image at an affine lattice; NaN outside `limits`.
 
-    `box` is (rows, cols, 2) float32, extended by `_BORDER` samples of its period on every side;
-    `affine` maps (u, v) to its samples; `out` is (n_v, n_u, 2) float32.
+    `box` is extended by `_BORDER` samples of its period on every side; it and `out` hold real and imaginary
+    parts in turns. `affine` maps (u, v) to samples.
     """
-    n_v, n_u = out.shape[:2]
+    n_v, n_u = out.shape[0], out.shape[1] // 2
     samples, weights, pixels = box.ravel(), table.ravel(), out.ravel()
     # Of 32 bits, as vector instructions convert to: enough for boxes of 2^30 samples.
-    stride, two, four, entries = np.int32(2 * box.shape[1]), np.int32(2), np.int32(4), np.int32(_TABLE)
+    stride, two, four, entries = np.int32(box.shape[1]), np.int32(2), np.int32(4), np.int32(_TABLE)
     starts, across, down = np.empty(n_u, np.int32), np.empty(n_u, np.int32), np.empty(n_u, np.int32)
     for v in range(n_v):
         x0 = affine[0, 1] * v + affine[0, 2]
@@ -440,9 +439,8 @@ class SubApertures:
 
     def _carrier_bin(self, aspect_rad: float) -> tuple[int, int]:
         """(row, col) bin of the spectrum, signed, nearest to the wedge's middle."""
-        k = self.acoustics.spectrum_sign * self._carrier * unit_to_sonar(aspect_rad)
-        steps = self.spectrum.step_rad_m
-        return round(-k[1] / steps[0]), round(k[0] / steps[1])
+        k, steps = self.acoustics.spectrum_sign * self._carrier, self.spectrum.step_rad_m
+        return round(-k * math.sin(aspect_rad) / steps[0]), round(k * math.cos(aspect_rad) / steps[1])
 
     def wedge_edges(self, aspect_rad: float) -> tuple[float, float]:
         """Return the angles in the spectrum between which the view's energy lies.
@@ -527,21 +525,20 @@ class SubApertures:
         info = self.info(aspect_rad)
         extended, shape, _ = self._extended_baseband(aspect_rad)
         # View pixel → ground → image pixel → sample of the small image.
+        rows, cols = self.spectrum.values.shape
+        scale_x, scale_y = shape[1] / cols, shape[0] / rows
         affine = (self.grid.ground_to_pixel @ info.camera.pixel_to_ground)[:2]
-        scale = np.array(shape[::-1]) / np.array(self.spectrum.values.shape[::-1])
-        affine = affine * scale[:, None]
+        affine *= ((scale_x,), (scale_y,))
         affine[:, 2] += _BORDER
         # The image reaches half a pixel beyond the centres of its outer pixels.
-        last = np.array([self.grid.cols, self.grid.rows]) - 0.5
-        limits = np.column_stack([-0.5 * scale, last * scale]).ravel() + _BORDER
-        pixels = np.empty(info.camera.shape, np.complex64)
-        _resample(
-            extended.view(np.float32).reshape(*extended.shape, 2),
-            _kernel_table(),
-            affine,
-            limits,
-            pixels.view(np.float32).reshape(*pixels.shape, 2),
+        limits = (
+            _BORDER - 0.5 * scale_x,
+            _BORDER + (self.grid.cols - 0.5) * scale_x,
+            _BORDER - 0.5 * scale_y,
+            _BORDER + (self.grid.rows - 0.5) * scale_y,
         )
+        pixels = np.empty(info.camera.shape, np.complex64)
+        _resample(extended.view(np.float32), _kernel_table(), affine, limits, pixels.view(np.float32))
         return View(info, pixels)
 
     def view(self, index: int) -> View:
