@@ -54,9 +54,8 @@ from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParam
 from csas_shadow_ros.core.segmentation import require_silhouette, segment_shadow
 from csas_shadow_ros.core.shadow import enhance
 from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
-from csas_shadow_ros.core.target import Target
 from csas_shadow_ros.core.threads import in_order
-from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.volume import Target, Volume
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent

@@ -35,7 +35,7 @@ from csas_shadow_ros.core.parameters import (
     TargetParameters,
 )
 from csas_shadow_ros.core.streaming import Stream
-from csas_shadow_ros.core.target import Target
+from csas_shadow_ros.core.volume import Target
 from csas_shadow_ros.graph import Graph, free_domain_id
 from csas_shadow_ros.replay import _Watcher, node_parameters
 from csas_shadow_ros.simulation import simulate

@@ -36,8 +36,7 @@ if TYPE_CHECKING:
 
     from .core.geometry import GroundGrid
     from .core.mesh import Dimensions
-    from .core.target import Target
-    from .core.volume import VoxelGrid
+    from .core.volume import Target, VoxelGrid
 
 #: Stages of a bag, and the nodes that turn each into the next.
 _CHAIN = {
@@ -462,7 +461,7 @@ def _until_complete(
     # What the result takes is loaded while the nodes are, one after the other: later they need every core.
     import trimesh  # noqa: F401
 
-    from .core import mesh, target, threshold  # noqa: F401
+    from .core import mesh, threshold  # noqa: F401
 
     source = "sub_aperture" if stage in ("image", "sector") else stage
     sender = "sub_aperture" if stage in ("image", "sector") else "bag_player"
@@ -528,8 +527,8 @@ def _collect(
     from msg_adapters import ground_picture_from_msgs, mesh_from_msg, target_from_msg, voxel_grid_from_msgs
 
     from .core.mesh import measure
-    from .core.target import Target
     from .core.threshold import thresholded
+    from .core.volume import Target
 
     result = ReplayResult(stage, target=target)
     for (node, stream), beat in sorted(watcher.beats.items()):

@@ -50,9 +50,9 @@ from csas_shadow_ros.core.parameters import (
 from csas_shadow_ros.core.pipeline import ProcessedView, run
 from csas_shadow_ros.core.shadow import enhance, focus_range
 from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
-from csas_shadow_ros.core.target import SignEvidence, Target, spectrum_sign_evidence
+from csas_shadow_ros.core.target import SignEvidence, spectrum_sign_evidence
 from csas_shadow_ros.core.threshold import occupied_voxels, supported
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.volume import Target, Volume, VoxelGrid
 from csas_shadow_ros.simulation import Faults, simulate
 from csas_shadow_ros.simulation.hull import iou, shadow_hull, voxelise_truth
 from csas_shadow_ros.simulation.scene import SceneModel

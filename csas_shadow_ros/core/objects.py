@@ -27,9 +27,9 @@ from .mesh import Dimensions, mesh_from_grid
 from .parameters import PipelineParameters
 from .segmentation import require_silhouette, segment_shadow
 from .shadow import enhance
-from .target import Search, Target, stands_on_seabed
+from .target import Search, stands_on_seabed
 from .threshold import LEAST_VOXELS
-from .volume import Volume, VoxelGrid
+from .volume import Target, Volume, VoxelGrid
 
 if TYPE_CHECKING:
     import trimesh

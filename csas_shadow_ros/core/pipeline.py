@@ -36,9 +36,9 @@ from .parameters import CarvingParameters, PipelineParameters
 from .segmentation import require_silhouette, segment_shadow
 from .shadow import enhance
 from .subaperture import Spectrum, SubApertures
-from .target import SignEvidence, Target, choose_target, find_target_and_others, spectrum_sign_evidence
+from .target import SignEvidence, choose_target, find_target_and_others, spectrum_sign_evidence
 from .threads import in_order
-from .volume import Volume, VoxelGrid
+from .volume import Target, Volume, VoxelGrid
 
 if TYPE_CHECKING:
     import trimesh

@@ -23,9 +23,9 @@ from .parameters import PipelineParameters, ShadowParameters, TargetParameters
 from .pipeline import Result, compose, correct_heights, open_hollows
 from .segmentation import require_silhouette, segment_shadow
 from .shadow import enhance
-from .target import Search, Target, choose_target, search_views
+from .target import Search, choose_target, search_views
 from .threads import in_order
-from .volume import Volume
+from .volume import Target, Volume
 
 #: Stages that a run can start from, first to last.
 STAGES = ("sub_aperture", "shadow", "likelihood", "shadow_mask")

@@ -26,9 +26,9 @@ from .geometry import TWO_PI, CoherentImage, Track
 from .parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from .sector import Sector, unlike
 from .subaperture import Spectrum, SubApertures
-from .target import Target, choose_target, find_target, spectrum_sign_evidence
+from .target import choose_target, find_target, spectrum_sign_evidence
 from .threads import in_order
-from .volume import Volume, VoxelGrid
+from .volume import Target, Volume, VoxelGrid
 
 if TYPE_CHECKING:
     from .pipeline import ProcessedView

@@ -29,7 +29,7 @@ from .parameters import (
 )
 from .shadow import enhance
 from .subaperture import Spectrum, SubApertures
-from .volume import Volume
+from .volume import MARGIN_SHARE, Target, Volume
 
 #: Aperture (deg) of the views that search: narrow enough that shadows stay sharp without enhancement.
 _SEARCH_APERTURE_DEG = 6.0
@@ -42,37 +42,10 @@ _DARK = 0.4
 _MIN_VOXELS = 12
 #: The darkest voxels of a body, as many as that, have a mean under this: its core is dark from all sides.
 _CORE = 0.28
-#: Margin round the body in the carved volume: a share of its size, and at least this many search voxels.
-_MARGIN_SHARE, _MARGIN_VOXELS = 0.25, 5
+#: The margin is at least this many search voxels.
+_MARGIN_VOXELS = 5
 #: The other sign must explain this many times more body than the stated one to be called the right one.
 _SIGN_RATIO = 4.0
-
-
-@dataclass(frozen=True)
-class Target:
-    """A body that the search found.
-
-    Parameters
-    ----------
-    position_m : (float, float)
-        Middle (x, y) of the volume to carve.
-    size_m : (float, float, float)
-        Size (x, y, z) of the volume to carve, margin included.
-    evidence : float
-        Sum of height over the body's voxels, m⁴: large for a large, high body.
-    stands : bool
-        Whether the body rests on the seabed (`stands_on_seabed`).
-    """
-
-    position_m: tuple[float, float]
-    size_m: tuple[float, float, float]
-    evidence: float = math.nan
-    stands: bool = True
-
-    @property
-    def reach_m(self) -> float:
-        """Distance from the middle within which the target's own shadows begin (margin excluded)."""
-        return 0.5 * math.hypot(self.size_m[0], self.size_m[1]) / (1.0 + 2.0 * _MARGIN_SHARE)
 
 
 def stands_on_seabed(bottom_m: float, top_m: float) -> bool:
@@ -180,14 +153,14 @@ def _bodies(likelihood: NDArray[np.float32], volume: Volume) -> list[Target]:
         low = np.array([volume.x_m[box[2].start], volume.y_m[box[1].start]]) - d / 2
         high = np.array([volume.x_m[box[2].stop - 1], volume.y_m[box[1].stop - 1]]) + d / 2
         size = high - low
-        margin = np.maximum(_MARGIN_SHARE * size, _MARGIN_VOXELS * d)
+        margin = np.maximum(MARGIN_SHARE * size, _MARGIN_VOXELS * d)
         top = float(z[-1]) + d / 2
         full = size + 2 * margin
         middle = (low + high) / 2
         found.append(
             Target(
                 (float(middle[0]), float(middle[1])),
-                (float(full[0]), float(full[1]), float(top + max(_MARGIN_SHARE * top, 2 * d))),
+                (float(full[0]), float(full[1]), float(top + max(MARGIN_SHARE * top, 2 * d))),
                 evidence,
                 stands_on_seabed(float(z[0]) - d / 2, top),
             )

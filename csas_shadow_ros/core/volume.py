@@ -1,7 +1,8 @@
-"""Voxel lattices: the volume that is carved, and the grid that carving leaves."""
+"""The target, the volume that is carved round it, and the grid that carving leaves."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,36 @@ from .errors import GeometryError, check_range
 
 if TYPE_CHECKING:
     from .seabed import SeabedSlope
+
+#: Margin round a body in the carved volume, as a share of its size.
+MARGIN_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Target:
+    """A body that the search found.
+
+    Parameters
+    ----------
+    position_m : (float, float)
+        Middle (x, y) of the volume to carve.
+    size_m : (float, float, float)
+        Size (x, y, z) of the volume to carve, margin included.
+    evidence : float
+        Sum of height over the body's voxels, m⁴: large for a large, high body.
+    stands : bool
+        Whether the body rests on the seabed (`stands_on_seabed`).
+    """
+
+    position_m: tuple[float, float]
+    size_m: tuple[float, float, float]
+    evidence: float = math.nan
+    stands: bool = True
+
+    @property
+    def reach_m(self) -> float:
+        """Distance from the middle within which the target's own shadows begin (margin excluded)."""
+        return 0.5 * math.hypot(self.size_m[0], self.size_m[1]) / (1.0 + 2.0 * MARGIN_SHARE)
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ from .flow import Flow
 from .params import NODES, declare, from_overrides
 
 if TYPE_CHECKING:
-    from csas_shadow_ros.core.target import Target
+    from csas_shadow_ros.core.volume import Target
 
 NAMESPACE = "csas"
 BEAT_S = 0.5
@@ -859,7 +859,7 @@ class TargetInlet:
         self.target: Target | None = None
         if self.known:
             # Late: the search behind it takes seconds to import, and most nodes need none of it.
-            from csas_shadow_ros.core.target import Target
+            from csas_shadow_ros.core.volume import Target
 
             size = getattr(p, "size_m", (0.0, 0.0, 0.0))
             self.target = Target((p.position_m[0], p.position_m[1]), (size[0], size[1], size[2]))
@@ -885,7 +885,7 @@ class TargetInlet:
 
     @staticmethod
     def _target_of(box: TargetBox | None) -> Target | None:
-        from csas_shadow_ros.core.target import Target
+        from csas_shadow_ros.core.volume import Target
 
         return None if box is None else Target((box.centre_m[0], box.centre_m[1]), box.size_m)
 

@@ -15,7 +15,8 @@ from csas_shadow_ros.core.geometry import CoherentImage, Track
 from csas_shadow_ros.core.parameters import SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.streaming import Stream
 from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
-from csas_shadow_ros.core.target import Target, choose_target, find_target, spectrum_sign_evidence
+from csas_shadow_ros.core.target import choose_target, find_target, spectrum_sign_evidence
+from csas_shadow_ros.core.volume import Target
 from csas_shadow_ros.core.warm import warm_sub_apertures
 from msg_adapters import (
     TOPICS,

@@ -17,8 +17,8 @@ from csas_shadow_ros.core.parameters import (
     SubApertureParameters,
     TargetParameters,
 )
-from csas_shadow_ros.core.target import Search, Target, stands_on_seabed
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.target import Search, stands_on_seabed
+from csas_shadow_ros.core.volume import Target, Volume, VoxelGrid
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.targets import box, cylinder, join_bodies
 
