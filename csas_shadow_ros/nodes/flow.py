@@ -24,6 +24,8 @@ _LONGEST_BACKOFF_S = 20.0
 _FIRST_RESEND_S = 1.0
 #: A source that was busy reads for so long what it was told meanwhile before it sends anything.
 _CATCH_UP_S = 0.05
+#: Once all are there that a source waits for, it listens for so long to what the last of them has to say.
+_LAST_WORD_S = 0.2
 
 
 def place_of(stream: str) -> int:
@@ -101,7 +103,8 @@ class Flow:
         Nothing is sent before so many sinks are there (or `sink_wait_s` is over).
     settle_s : float
         How long after the first subscriber or consumer the source listens before it sends: heartbeats and
-        kept reports tell it who reports, and what is done already.
+        kept reports tell it who reports, and what is done already. Less if `min_sinks` are there, and a
+        stage for every step before them: then there is nobody to be heard.
     clock : callable
         Seconds; monotonic.
     """
@@ -144,7 +147,7 @@ class Flow:
         self._progress_s = self._born_s = self._served_s = self._looked_s = self.clock()
         self._subscribers = 0
         self._met_s: float | None = None
-        self._back_s = -math.inf
+        self._back_s = self._arrived_s = -math.inf
 
     # What the source has
 
@@ -213,6 +216,7 @@ class Flow:
     def _arrived(self, peer: Peer) -> None:
         name = (peer.node, peer.stream)
         self._gone.pop(name, None)
+        self._arrived_s = self.clock()
         if peer.role == "sink":
             # A process of this name before it died: its reports will never be asked for again.
             for other in list(self.peers.values()):
@@ -350,6 +354,8 @@ class Flow:
         """Say what the source waits for before it sends anything; empty if for nothing."""
         now = self.clock()
         new = self._met_s is not None and now - self._met_s < self.settle_s
+        if new and self._all_there():
+            new = now - self._arrived_s < _LAST_WORD_S
         if new or now - self._back_s < min(_CATCH_UP_S, self.settle_s):
             return "whoever else is there to be heard"
         if others := sorted({p.node for p in self.live() if not self._counts(p)}):
@@ -361,6 +367,15 @@ class Flow:
         if not self._leaves and not self._subscribers and now - self._served_s < self.sink_wait_s:
             return "a consumer"
         return ""
+
+    def _all_there(self) -> bool:
+        """Say whether as many sinks are there as are waited for, and all stages that lead to them."""
+        sinks = {p.node: place_of(p.stream) for p in self.sinks()}
+        if not 0 < self.min_sinks <= len(sinks):
+            return False
+        last = max(sinks.values())
+        stages = {place_of(p.stream) for p in self.live() if p.role == "stage"}
+        return last != _LAST and stages >= set(range(place_of(self.stream), last))
 
     def next(self, *, fresh: bool = True) -> int | None:
         """Return the stamp of the view to send now, None if none is to be sent; it counts as sent.

@@ -380,6 +380,25 @@ def test_a_source_listens_before_it_sends_so_that_it_knows_who_reports_what() ->
     assert not flow.acknowledged_by_transport
 
 
+@pytest.mark.parametrize("missing", ["", "stage", "sink"])
+def test_a_source_listens_no_longer_once_all_are_there_that_it_waits_for(missing: str) -> None:
+    flow, clock = make_flow(6, settle_s=1.0, min_sinks=2)
+    flow.look(subscribers=2)
+    Consumer(flow, "enhancement", role="stage", stream="sub_aperture").beat()
+    if missing != "stage":
+        Consumer(flow, "likelihood", role="stage", stream="shadow").beat()
+    carver = Consumer(flow, "carver", stream="shadow_mask")
+    if missing != "sink":
+        Consumer(flow, "composites", stream="sub_aperture").beat()
+    clock.now += 0.1
+    carver.beat()
+    assert flow.next() is None  # kept reports may still be on their way
+    carver.report(1)
+    clock.now += 0.15
+    flow.look(subscribers=2)
+    assert bool(take_all(flow)) == (not missing)
+
+
 def test_a_source_that_computed_meanwhile_reads_what_it_was_told_and_waits_no_longer() -> None:
     flow, clock = make_flow(6, settle_s=1.0)
     flow.look(subscribers=0)
