@@ -66,6 +66,8 @@ BEAT_S = 0.5
 _LOG_EVERY_S = 10.0
 _MAX_KINDS = 32
 _LONELY_S = 5.0
+#: How soon a node that nothing happens to notices that it is told to stop.
+_STOP_S = 0.05
 #: How often it is looked who publishes latched topics: sooner than a large image is through.
 _DURABILITY_S, _WHO_S = 0.05, 1.0
 
@@ -970,7 +972,7 @@ def spin(node: CsasNode, stop: threading.Event) -> None:
     try:
         while not stop.is_set() and node.context.ok():
             try:
-                executor.spin_once(timeout_sec=0.2)
+                executor.spin_once(timeout_sec=_STOP_S)
             except ExternalShutdownException:
                 return
             except Exception as error:
