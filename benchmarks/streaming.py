@@ -99,7 +99,7 @@ def play(bag: Path, parameters: PipelineParameters, rate: float, publish_hz: flo
             watcher._subscribe("voxel_grid/image", watcher._qos.LATCHED, partial(take, grids))
             began = time.monotonic()
             while time.monotonic() - began < 900.0:
-                watcher.spin(0.1)
+                watcher.spin(0.01)  # no coarser than what is measured
                 graph.watch()
                 beat = watcher.beats.get(("voxel_carver", "shadow_mask"))
                 if beat is not None and beat.counts.get("complete"):

@@ -362,8 +362,14 @@ class Stream:
         """Return the arcs that the track covers, but no sector."""
         return [] if self.track is None else uncovered(self.sum.arcs, self.track)
 
-    def update(self) -> list[int]:
+    def update(self, *, decide: bool = True) -> list[int]:
         """Decide on the target as far as it can be, and return the stamps of the views that became due.
+
+        Parameters
+        ----------
+        decide : bool
+            Whether target and views of the whole run are decided on, if all sectors are here. That takes a
+            search: somebody who makes views meanwhile for the target as it is known may put it off.
 
         Raises
         ------
@@ -374,7 +380,7 @@ class Stream:
             return []
         if self.sub_apertures is None:
             self._begin(self.track)
-        if self.ended and not self.final:
+        if self.ended and not self.final and (decide or not self.target_known):
             self._decide(self.track)
         elif not self.target_known:
             self._decide_for_now(self.track)
@@ -383,7 +389,7 @@ class Stream:
         due = [
             stamp
             for stamp, aspect in self._aspect_of.items()
-            if stamp not in self._given and (self.ended or self._is_whole(aspect))
+            if stamp not in self._given and (self.final or self._is_whole(aspect))
         ]
         self._given.update(due)
         return due

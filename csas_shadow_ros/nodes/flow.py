@@ -441,6 +441,11 @@ class Flow:
         return len(self._in_flight)
 
     @property
+    def unfinished(self) -> bool:
+        """Whether a view that was offered is still to be sent, or on its way."""
+        return any(s not in self.lost for s in self._missing)
+
+    @property
     def refused(self) -> dict[int, str]:
         """Views that the source could not make after all, and why."""
         return self._refused

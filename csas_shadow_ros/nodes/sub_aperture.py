@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from typing import Any
 
 from csas_shadow_ros.bags.check import ERROR, judge_band, judge_coverage, judge_geometry, judge_image
@@ -42,6 +43,9 @@ _IRREGULAR = {
     "out_of_order": "came after later ones; the result is the same",
     "late": "came after views that it changes were made; all views are made again",
 }
+
+#: So long the search for the whole run's target waits at most for views that are due already.
+_DECIDE_S = 2.0
 
 
 class SubApertureNode(CsasNode):
@@ -82,6 +86,8 @@ class SubApertureNode(CsasNode):
         self.due: list[int] = []
         self.target_sent = 0
         self.source_ended = False
+        #: When all sectors were here; None before, and once the whole run's target is decided on.
+        self.ended_s: float | None = None
         self.refusals_sent: set[float] = set()
         self.sub_apertures: SubApertures | None = None
         self.aspects: dict[int, float] = {}
@@ -211,10 +217,13 @@ class SubApertureNode(CsasNode):
         """Offer the views that can be made by now; begin again where the target or the views have changed."""
         stream, flow = self.stream, self.source.flow
         if stream is None or self.failed:
+            self.ended_s = None
             return
+        decide = self.decides(stream)
         try:
-            self.judge_stream(stream)
-            due = stream.update()
+            if decide or not stream.ended:
+                self.judge_stream(stream)
+            due = stream.update(decide=decide)
         except CsasError as error:
             self.fail(error)
             return
@@ -228,9 +237,25 @@ class SubApertureNode(CsasNode):
         else:
             self.offer_due(stream)
 
+    def decides(self, stream: Stream) -> bool:
+        """Say whether it is time to decide on the whole run's target, once all sectors are here.
+
+        The search takes a second. Views that are due already, and whoever looks at the grid, need not wait
+        for it, unless they wait for something else themselves.
+        """
+        if not stream.ended or stream.final or not stream.target_known:
+            self.ended_s = None
+            return True
+        if self.ended_s is None:
+            self.ended_s = time.monotonic()
+            return False  # the last sector's views are not even offered yet
+        return not self.source.flow.unfinished or time.monotonic() - self.ended_s > _DECIDE_S
+
     def begin_again(self) -> None:
         """Publish another target, and offer its views, once those of the one before have left the graph."""
         stream, flow = self.stream, self.source.flow
+        if self.ended_s is not None:
+            self.advancing.trigger()
         if stream is None or not flow.held or flow.in_flight:
             return
         self.target_sent = max(stream.sum.newest_ns, self.target_sent + 1)

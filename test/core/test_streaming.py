@@ -152,6 +152,34 @@ def test_a_view_is_made_as_soon_as_the_sectors_cover_its_aperture_and_no_sooner(
     assert stream.revision == 0, "nothing was made twice"
 
 
+def test_the_search_of_the_whole_circle_can_wait_for_the_last_sectors_views(simulated, sectors):
+    stream = Stream(GIVEN.sub_aperture, GIVEN.target)
+    stream.take_track(simulated.track)
+    for sector in sectors[:-1]:
+        stream.add(sector)
+    before = set(stream.update())
+    stream.add(sectors[-1])
+    assert stream.ended
+    last = set(stream.update(decide=False))
+    assert not stream.final
+    assert len(before | last) == 36
+    assert stream.update(decide=False) == []
+    assert stream.update() == []
+    assert stream.final
+    assert stream.revision == 0
+
+
+def test_what_only_the_end_makes_due_waits_for_it(simulated, sectors):
+    stream = Stream(GIVEN.sub_aperture, GIVEN.target)
+    stream.take_track(simulated.track)
+    for sector in with_a_hole(sectors):
+        stream.add(sector)
+    whole_ones = set(stream.update())
+    stream.finish()
+    assert stream.update(decide=False) == []
+    assert len(whole_ones | set(stream.update())) == 36
+
+
 def test_a_target_is_looked_for_on_the_way_and_again_when_the_circle_is_closed(simulated, sectors):
     run = StreamedRun(AUTO, first_search_deg=120.0)
     run.take_track(simulated.track)

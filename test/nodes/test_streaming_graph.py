@@ -16,6 +16,7 @@ from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M, Graph
 from csas_shadow_ros.bags import read_run, write_run
 from csas_shadow_ros.core.pipeline import Result, run
 from csas_shadow_ros.core.sector import Sector
+from csas_shadow_ros.core.streaming import Stream
 from csas_shadow_ros.nodes import qos
 from csas_shadow_ros.nodes.bag_player import BagPlayerNode
 from csas_shadow_ros.nodes.shadow_enhancement import ShadowEnhancementNode
@@ -95,6 +96,23 @@ def test_views_come_while_sectors_do_and_the_grid_is_that_of_the_whole_run(
     assert nodes["sub_aperture"].state_counts()["arc_deg"] == 360
     assert nodes["sub_aperture"].state_counts()["revision"] == 0
     assert nodes["carver"].state_counts()["arc_deg"] == 360
+
+
+def test_the_last_sectors_views_are_through_before_the_whole_circle_is_searched(
+    graph: Graph, sector_bag: Path, reference_of_sectors: Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    through: list[int] = []
+    decide = Stream._decide
+
+    def counted(stream: Stream, track: Any) -> None:
+        through.append(nodes["carver"].state_counts()["views"])
+        decide(stream, track)
+
+    monkeypatch.setattr(Stream, "_decide", counted)
+    nodes = streaming_graph(graph, sector_bag, 60.0, **given(reference_of_sectors))
+    graph.spin_until(complete(nodes), 60.0)
+    assert through == [36]
+    assert_same_grid(nodes["carver"], reference_of_sectors)
 
 
 def test_the_target_of_an_open_circle_moves_when_it_is_closed_and_all_is_carved_again(
