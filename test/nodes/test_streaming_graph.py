@@ -17,7 +17,7 @@ from csas_shadow_ros.bags import read_run, write_run
 from csas_shadow_ros.core.pipeline import Result, run
 from csas_shadow_ros.core.sector import Sector
 from csas_shadow_ros.core.streaming import Stream
-from csas_shadow_ros.nodes import qos
+from csas_shadow_ros.nodes import qos, sub_aperture
 from csas_shadow_ros.nodes.bag_player import BagPlayerNode
 from csas_shadow_ros.nodes.shadow_enhancement import ShadowEnhancementNode
 from csas_shadow_ros.nodes.shadow_likelihood import ShadowLikelihoodNode
@@ -109,6 +109,7 @@ def test_the_last_sectors_views_are_through_before_the_whole_circle_is_searched(
         decide(stream, track)
 
     monkeypatch.setattr(Stream, "_decide", counted)
+    monkeypatch.setattr(sub_aperture, "_DECIDE_S", 60.0)  # on a busy machine too
     nodes = streaming_graph(graph, sector_bag, 60.0, **given(reference_of_sectors))
     graph.spin_until(complete(nodes), 60.0)
     assert through == [36]
@@ -203,8 +204,13 @@ def test_what_is_missing_of_the_circle_is_said(
     assert nodes["sub_aperture"].state_counts()["arc_deg"] == 330
 
 
+@pytest.mark.parametrize("target_is_given", [False, True])  # views are due then that nobody takes
 def test_a_wrong_spectrum_sign_is_named_when_the_circle_is_closed(
-    graph: Graph, simulated: SimulatedRun, tmp_path: Path
+    graph: Graph,
+    simulated: SimulatedRun,
+    reference_of_sectors: Result,
+    tmp_path: Path,
+    target_is_given: bool,
 ) -> None:
     from dataclasses import replace
 
@@ -212,7 +218,8 @@ def test_a_wrong_spectrum_sign_is_named_when_the_circle_is_closed(
     image = replace(simulated.image, pixels=simulated.image.pixels, acoustics=acoustics)
     sectors = [sector for sector, _ in sectors_of_run(image, simulated.track, SECTOR_DEG)]
     bag = write_run(tmp_path / "wrong", None, simulated.track, sectors=sectors)
-    node = graph.add(SubApertureNode, step_deg=STEP_DEG)
+    target = given(reference_of_sectors) if target_is_given else {}
+    node = graph.add(SubApertureNode, step_deg=STEP_DEG, **target)
     graph.add(BagPlayerNode, bag=str(bag), rate=0.0, min_sinks=1)
     said: list[Any] = []
     viewer = graph.plain_node("viewer")
