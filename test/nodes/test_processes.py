@@ -75,12 +75,19 @@ def graphs(monkeypatch: pytest.MonkeyPatch) -> list[Graph]:
     return started
 
 
+#: Views enough that a run is not over while the replay listens: it does so ten times a second.
+LONG = replace(PARAMETERS, sub_aperture=SubApertureParameters(step_deg=2.0))
+
+
+@pytest.fixture(scope="module")
+def reference_of_long(simulated: SimulatedRun) -> Reference:
+    """The run with as many views in one process."""
+    return run(simulated.image, simulated.track, LONG), []
+
+
 def test_every_process_killed_once_in_mid_run_and_the_grid_and_the_recording_are_the_same(
-    simulated: SimulatedRun, run_bag: Path, tmp_path: Path, graphs: list[Graph]
+    run_bag: Path, reference_of_long: Reference, tmp_path: Path, graphs: list[Graph]
 ) -> None:
-    # Views enough that the run is not over while the replay listens: it does so ten times a second.
-    parameters = replace(PARAMETERS, sub_aperture=SubApertureParameters(step_deg=2.0))
-    reference = run(simulated.image, simulated.track, parameters)
     order = ["shadow_enhancement", "voxel_carver", "sub_aperture", "shadow_likelihood"]
     order += ["bag_recorder", "bag_player"]
     pids: list[int] = []
@@ -102,7 +109,7 @@ def test_every_process_killed_once_in_mid_run_and_the_grid_and_the_recording_are
         result = replay(
             run_bag,
             folder,
-            parameters,
+            LONG,
             record=True,
             composites=False,
             progress=kill_as_it_goes,
@@ -113,7 +120,7 @@ def test_every_process_killed_once_in_mid_run_and_the_grid_and_the_recording_are
     assert len(victims) >= 3, f"the run was over before more could be killed: {victims}"
     assert len(deaths) == len(victims)
     assert all(f"{name} was killed by signal 9" in line for name, line in zip(victims, deaths, strict=True))
-    assert_same_grid(result, (reference, []))
+    assert_same_grid(result, reference_of_long)
     assert result.lost == 0
     assert {name: result.nodes[name].restarts for name in victims if name in result.nodes} == {
         name: 1 for name in victims if name in result.nodes
@@ -241,7 +248,7 @@ def test_a_recorder_that_is_interrupted_finishes_its_bag(tmp_path: Path) -> None
 
 
 def test_a_recorder_that_is_ended_in_mid_run_goes_on_with_its_bag(
-    run_bag: Path, reference: Reference, tmp_path: Path, graphs: list[Graph]
+    run_bag: Path, reference_of_long: Reference, tmp_path: Path, graphs: list[Graph]
 ) -> None:
     ended: list[int] = []
 
@@ -253,14 +260,14 @@ def test_a_recorder_that_is_ended_in_mid_run_goes_on_with_its_bag(
 
     for attempt in range(3):  # a busy machine may hear of the whole short run at once
         folder = tmp_path / str(attempt)
-        result = replay(run_bag, folder, PARAMETERS, record=True, composites=False, progress=end_it)
+        result = replay(run_bag, folder, LONG, record=True, composites=False, progress=end_it)
         if ended:
             break
     assert ended
-    assert_same_grid(result, reference)
-    run = read_run(folder / "recording")
+    assert_same_grid(result, reference_of_long)
+    recorded = read_run(folder / "recording")
     for stream in ("sub_aperture", "shadow", "likelihood", "shadow_mask"):
-        assert run.counts[stream] == result.views_total, stream
+        assert recorded.counts[stream] == result.views_total, stream
 
 
 def test_a_recording_that_is_there_is_refused_unless_it_is_to_be_gone_on_with(
