@@ -75,6 +75,39 @@ class Levels:
             self._echoes[echo_db] = echo_mask(self.local, echo_db)
         return self._echoes[echo_db]
 
+    def unknown_echoes(self, parameters: LikelihoodParameters) -> NDArray[np.bool_]:
+        """Return the echoes that know nothing: all or none, as the parameters say."""
+        return self.echoes(parameters.echo_db) if parameters.echo_unknown else np.zeros_like(self.known)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _l_out(power: np.float32, contrast2: np.float32, octaves: np.float32) -> np.float32:  # pragma: no cover
+    """Evaluate `l_out` of one power, for (σ_r/σ_s)² and (1 - (σ_r/σ_s)²) / ln 2.
+
+    The exponential is 2^n · 2^f with a polynomial for f in [-½, ½], as the compiler makes vectors of that but
+    not of a library's: right to 2.5e-7 of itself, and l_out to 4e-7.
+    """
+    # Beyond 2^-126 nothing is left of it beside 1.
+    exponent = max(power * octaves, np.float32(-126.0))
+    n = np.int32(exponent - np.float32(0.5))
+    f = exponent - np.float32(n)
+    part = np.float32(1.5403530e-4) * f + np.float32(1.3333558e-3)
+    part = part * f + np.float32(9.6181291e-3)
+    part = part * f + np.float32(5.5504109e-2)
+    part = part * f + np.float32(2.4022651e-1)
+    part = part * f + np.float32(6.9314718e-1)
+    part = part * f + np.float32(1.0)
+    # A float32 whose exponent is n and whose fraction is zero.
+    power_of_two = np.int32((n + 127) << 23).view(np.float32)
+    inverse = np.float32(1.0) / (np.float32(1.0) + contrast2 * (part * power_of_two))
+    return inverse * inverse
+
+
+def _constants(contrast: float) -> tuple[np.float32, np.float32]:
+    """Return what `_l_out` takes of a contrast."""
+    contrast2 = contrast * contrast
+    return np.float32(contrast2), np.float32((1.0 - contrast2) / math.log(2.0))
+
 
 def l_out(power: FloatImage, contrast: float) -> FloatImage:
     """Evaluate l_out = (p_r / (p_r + p_s))² for powers (i/σ_r)²/2 and contrast σ_r/σ_s.
@@ -89,14 +122,17 @@ def l_out(power: FloatImage, contrast: float) -> FloatImage:
     contrast : float
         σ_r/σ_s, over 1.
     """
-    c2 = np.float32(contrast * contrast)
-    out = power * (np.float32(1.0) - c2)
-    np.exp(out, out=out)
-    out *= c2
-    out += np.float32(1.0)
-    np.reciprocal(out, out=out)
-    np.square(out, out=out)
+    out = np.empty(power.shape, np.float32)
+    _l_out_of_all(np.ascontiguousarray(power).ravel(), *_constants(contrast), out.ravel())
     return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _l_out_of_all(
+    power: FloatImage, contrast2: np.float32, octaves: np.float32, out: FloatImage
+) -> None:  # pragma: no cover
+    for i in range(power.size):
+        out[i] = _l_out(power[i], contrast2, octaves)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -105,16 +141,11 @@ def _l_out_of_known(
     known: NDArray[np.bool_],
     echo: NDArray[np.bool_],
     spans: Spans,
-    contrast: float,
+    contrast2: np.float32,
+    octaves: np.float32,
     out: FloatImage,
 ) -> None:  # pragma: no cover
-    """Evaluate `l_out` of the known pixels that are no echo; NaN elsewhere.
-
-    The exponential is 2^n · 2^f with a polynomial for f in [-½, ½], as the compiler makes vectors of that but
-    not of a library's. It is right to 2e-7, and so is the library's, whose exponent is rounded as well.
-    """
-    c2 = np.float32(contrast * contrast)
-    scale = np.float32((1.0 - contrast * contrast) / math.log(2.0))
+    """Evaluate `l_out` of the known pixels that are no echo; NaN elsewhere."""
     for v in range(power.shape[0]):
         first, last = spans[v]
         out[v, :first] = np.nan
@@ -122,20 +153,8 @@ def _l_out_of_known(
         of, to = power[v, first:last], out[v, first:last]
         here, bright = known[v, first:last], echo[v, first:last]
         for i in range(last - first):
-            # Beyond 2^-126 nothing is left of it beside 1.
-            exponent = max(of[i] * scale, np.float32(-126.0))
-            n = np.int32(exponent - np.float32(0.5))
-            f = exponent - np.float32(n)
-            part = np.float32(1.5403530e-4) * f + np.float32(1.3333558e-3)
-            part = part * f + np.float32(9.6181291e-3)
-            part = part * f + np.float32(5.5504109e-2)
-            part = part * f + np.float32(2.4022651e-1)
-            part = part * f + np.float32(6.9314718e-1)
-            part = part * f + np.float32(1.0)
-            # A float32 whose exponent is n and whose fraction is zero.
-            power_of_two = np.int32((n + 127) << 23).view(np.float32)
-            inverse = np.float32(1.0) / (np.float32(1.0) + c2 * (part * power_of_two))
-            to[i] = inverse * inverse if here[i] and not bright[i] else np.float32(np.nan)
+            value = _l_out(of[i], contrast2, octaves)
+            to[i] = value if here[i] and not bright[i] else np.float32(np.nan)
 
 
 def expected_l_out(contrast: float) -> tuple[float, float]:
@@ -467,7 +486,8 @@ def outside_likelihood(
         rows_m, cols_m = view.info.camera.spacing_m
         radius = round(p.smoothing_m / (2.0 * rows_m)), round(p.smoothing_m / (2.0 * cols_m))
         power = box_mean(power, levels.known, radius)
-    echo = levels.echoes(p.echo_db) if p.echo_unknown else np.zeros_like(levels.known)
     out = np.empty_like(power)
-    _l_out_of_known(power, levels.known, echo, levels.local.spans, levels.contrast, out)
+    _l_out_of_known(
+        power, levels.known, levels.unknown_echoes(p), levels.local.spans, *_constants(levels.contrast), out
+    )
     return replace(view, pixels=out)

@@ -56,18 +56,18 @@ def dark_pixels(
         The part of the view to look at, without steps: all of it.
     """
     cells = zip(_HALF_CELLS, info.resolution_m, info.camera.spacing_m, strict=True)
-    half = (int(min(max(round(half * cell / pixel), 1), _MAX_RADIUS)) for half, cell, pixel in cells)
-    radius = next(half), next(half)
+    down_px, across_px = (
+        int(min(max(round(half * cell / pixel), 1), _MAX_RADIUS)) for half, cell, pixel in cells
+    )
     shadow_power = 1.0 / levels.contrast**2
     # A threshold below one half draws a straight edge across the box in by a known part of it: the far end
     # of the shadow, which tells the height, is put back.
-    down = round((0.5 - _DARK) * (2 * radius[0] + 1))
+    drawn_in = round((0.5 - _DARK) * (2 * down_px + 1))
     first, last, _ = rows.indices(levels.known.shape[0])
-    begin = max(0, first - down)
-    dark = levels.local.under(
-        radius, shadow_power + _DARK * (1.0 - shadow_power), slice(begin, last), cols
-    )
-    return np.asarray(_drawn_down(dark, down)[first - begin :] & levels.known[rows, cols])
+    begin = max(0, first - drawn_in)
+    threshold = shadow_power + _DARK * (1.0 - shadow_power)
+    dark = levels.local.under((down_px, across_px), threshold, slice(begin, last), cols)
+    return np.asarray(_drawn_down(dark, drawn_in)[first - begin :] & levels.known[rows, cols])
 
 
 def _drawn_down(dark: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:
@@ -114,7 +114,7 @@ def segment_shadow(
     """
     p = parameters or LikelihoodParameters()
     levels = levels or view_levels(view, p)
-    echo = levels.echoes(p.echo_db) if p.echo_unknown else np.zeros_like(levels.known)
+    echo = levels.unknown_echoes(p)
     mask = np.empty(levels.known.shape, np.uint8)
     _compose(levels.known.ravel(), echo.ravel(), mask.ravel())
     shadow, (top, left) = _of_target(levels, view.info, target_m, reach_m)
