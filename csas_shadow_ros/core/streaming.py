@@ -380,7 +380,7 @@ class Stream:
             return []
         if self.sub_apertures is None:
             self._begin(self.track)
-        if self.ended and not self.final and (decide or not self.target_known):
+        if self.ended and not self.final and decide:
             self._decide(self.track)
         elif not self.target_known:
             self._decide_for_now(self.track)

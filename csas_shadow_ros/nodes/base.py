@@ -15,7 +15,7 @@ import traceback
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import rclpy
 from rclpy.context import Context
@@ -32,6 +32,7 @@ from rclpy.subscription import Subscription
 
 from csas_shadow_ros.core.errors import CsasError, ParameterError
 from csas_shadow_ros.core.geometry import View
+from csas_shadow_ros.core.volume import Target
 from msg_adapters import (
     TOPICS,
     Heartbeat,
@@ -57,9 +58,6 @@ from msg_adapters.topics import stream as stream_of
 from . import qos
 from .flow import Flow
 from .params import NODES, declare, from_overrides
-
-if TYPE_CHECKING:
-    from csas_shadow_ros.core.volume import Target
 
 NAMESPACE = "csas"
 BEAT_S = 0.5
@@ -860,9 +858,6 @@ class TargetInlet:
         self.known = p.target == "given"
         self.target: Target | None = None
         if self.known:
-            # Late: the search behind it takes seconds to import, and most nodes need none of it.
-            from csas_shadow_ros.core.volume import Target
-
             size = getattr(p, "size_m", (0.0, 0.0, 0.0))
             self.target = Target((p.position_m[0], p.position_m[1]), (size[0], size[1], size[2]))
         else:
@@ -887,8 +882,6 @@ class TargetInlet:
 
     @staticmethod
     def _target_of(box: TargetBox | None) -> Target | None:
-        from csas_shadow_ros.core.volume import Target
-
         return None if box is None else Target((box.centre_m[0], box.centre_m[1]), box.size_m)
 
     @staticmethod

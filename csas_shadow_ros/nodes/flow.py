@@ -441,7 +441,7 @@ class Flow:
         return len(self._in_flight)
 
     @property
-    def unfinished(self) -> bool:
+    def pending(self) -> bool:
         """Whether a view that was offered is still to be sent, or on its way."""
         return any(s not in self.lost for s in self._missing)
 
@@ -463,7 +463,7 @@ class Flow:
         if self.waiting_for():
             return False
         nobody = not self._leaves and not self._subscribers
-        return nobody or all(s in self.lost for s in self._missing)
+        return nobody or not self.pending
 
     def finished_for(self) -> Iterator[str]:
         """Iterate the instances of the consumers that have, or will never have, every view."""

@@ -67,7 +67,7 @@ class SubApertureNode(CsasNode):
         self.follow_sources()
         self.beginning = self.background(self.begin)
         self.advancing = self.background(self.advance)
-        self.every(0.05, self.begin_again)
+        self.every(0.05, self.look_again)
 
     @classmethod
     def preload(cls) -> None:
@@ -249,13 +249,17 @@ class SubApertureNode(CsasNode):
         if self.ended_s is None:
             self.ended_s = time.monotonic()
             return False  # the last sector's views are not even offered yet
-        return not self.source.flow.unfinished or time.monotonic() - self.ended_s > _DECIDE_S
+        return not self.source.flow.pending or time.monotonic() - self.ended_s > _DECIDE_S
+
+    def look_again(self) -> None:
+        """Go on with what waits until views that are on their way have left the graph."""
+        if self.ended_s is not None:
+            self.advancing.trigger()
+        self.begin_again()
 
     def begin_again(self) -> None:
         """Publish another target, and offer its views, once those of the one before have left the graph."""
         stream, flow = self.stream, self.source.flow
-        if self.ended_s is not None:
-            self.advancing.trigger()
         if stream is None or not flow.held or flow.in_flight:
             return
         self.target_sent = max(stream.sum.newest_ns, self.target_sent + 1)
