@@ -1,0 +1,179 @@
+"""What a run leaves: plain data, the same whoever fed the views, and on topics as in a results folder."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh import Dimensions
+from ..volume import Target, VoxelGrid
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from ..composites import Composites
+    from ..target import SignEvidence
+
+#: What a run can find.
+VERDICTS = ("object", "no object", "undecided")
+#: How far its result can be trusted.
+QUALITIES = ("good", "limited", "not trustworthy")
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How far a result can be trusted.
+
+    Parameters
+    ----------
+    verdict : str
+        One of `QUALITIES`.
+    reasons : tuple of str
+        Why it is not better; empty if it is good.
+    """
+
+    verdict: str = "good"
+    reasons: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ViewEvidence:
+    """What one view contributed.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        The view.
+    aspect_rad : float
+        Where it looked from.
+    sonar_m : (float, float, float)
+        Position of the sonar, scene frame.
+    seabed_level : float
+        σ_r, the mode of the seabed's amplitude; NaN of a view of which only the silhouette came.
+    contrast : float
+        σ_r / σ_s; NaN likewise.
+    levels_estimated : bool
+        Whether the shadow's level was measured in the view (otherwise the contrast hypothesis).
+    height_m : float
+        Height that the length of its shadow implies; NaN where there is no shadow or no object.
+    """
+
+    stamp_ns: int
+    aspect_rad: float
+    sonar_m: tuple[float, float, float]
+    seabed_level: float = math.nan
+    contrast: float = math.nan
+    levels_estimated: bool = False
+    height_m: float = math.nan
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A body that is no object, or was not looked at: where it is (x, y) and why."""
+
+    position_m: tuple[float, float]
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectResult:
+    """One object of the scene.
+
+    Parameters
+    ----------
+    target : Target
+        The volume that was carved; for one of several pieces in a volume, the piece's part of it.
+    grid : VoxelGrid
+        By the chosen method; nothing is occupied but the object.
+    mesh, dimensions : trimesh.Trimesh, Dimensions
+        Surface and measures.
+    views_used : int
+        Views in the grid.
+    """
+
+    target: Target
+    grid: VoxelGrid
+    mesh: trimesh.Trimesh
+    dimensions: Dimensions
+    views_used: int
+
+
+@dataclass(eq=False)
+class Result:
+    """What a run leaves.
+
+    Attributes
+    ----------
+    run_ns : int or None
+        The run's name: the stamp of its track's first pose; None where there is no track.
+    stamp_ns : int
+        Stamp of the newest view in it; 0 before the first.
+    final : bool
+        Whether no more views are to come.
+    verdict : str
+        One of `VERDICTS`.
+    quality : Quality
+        How far that can be trusted, and why not further.
+    target : Target or None
+        The volume that was carved; None: nothing was found to carve.
+    sign : SignEvidence or None
+        Whether the shadows fit the spectrum sign; None if it was not checked.
+    grid, other_grid : VoxelGrid or None
+        By the chosen method, and by the other one (where it was asked for).
+    mesh, dimensions : trimesh.Trimesh, Dimensions or None
+        Surface and measures of the object.
+    matter : ndarray of bool, shape (nz, ny, nx), or None
+        The grid's object without the hollows that its echoes show; None where no echo was looked at.
+    matter_mesh : trimesh.Trimesh or None
+        Its surface: `mesh` itself where there is no hollow.
+    composites : Composites or None
+        Multi-look and colour-by-aspect images.
+    views_used : int
+        Views in the grid.
+    arc_rad : float
+        How much of the circle their apertures cover.
+    rejected : dict
+        Reason for each aspect (degrees) whose view was not used.
+    evidence : dict of ViewEvidence
+        What each view in the grid contributed, by stamp.
+    further : list of ObjectResult
+        What else stands on the seabed, in the order of the search's evidence.
+    left_out : list of LeftOut
+        Bodies of the search that are no objects, and why.
+    timings_s : dict
+        Seconds of wall time by step.
+    """
+
+    run_ns: int | None = None
+    stamp_ns: int = 0
+    final: bool = True
+    verdict: str = "no object"
+    quality: Quality = Quality()
+    target: Target | None = None
+    sign: SignEvidence | None = None
+    grid: VoxelGrid | None = None
+    other_grid: VoxelGrid | None = None
+    mesh: trimesh.Trimesh | None = None
+    dimensions: Dimensions | None = None
+    matter: NDArray[np.bool_] | None = None
+    matter_mesh: trimesh.Trimesh | None = None
+    composites: Composites | None = None
+    views_used: int = 0
+    arc_rad: float = 0.0
+    rejected: dict[float, str] = field(default_factory=dict)
+    evidence: dict[int, ViewEvidence] = field(default_factory=dict)
+    further: list[ObjectResult] = field(default_factory=list)
+    left_out: list[LeftOut] = field(default_factory=list)
+    timings_s: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def objects(self) -> list[ObjectResult]:
+        """Every object, the target first (unless its carving left none)."""
+        if self.target is None or self.grid is None or self.mesh is None or self.dimensions is None:
+            return list(self.further)
+        main = ObjectResult(self.target, self.grid, self.mesh, self.dimensions, self.views_used)
+        return [main, *self.further]
