@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -110,6 +110,35 @@ class Dimensions:
     position_m: tuple[float, float]
     hull_top_m: float = math.nan
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def rounded(self, voxel_size_m: float) -> Dimensions:
+        """Return the measures without digits that say nothing.
+
+        Lengths in the power of ten that is at most a hundredth of a voxel, the heading in 1e-4 rad. The
+        least-squares fits behind them carry the rounding of the FFT, some 1e-9 m: the sum of sectors and the
+        image that they are of would differ in digits that nobody measured. Ten times finer, one value in 10⁴
+        would still differ; ten times coarser, the digits would begin to matter beside the interval.
+        """
+        digits = -math.floor(math.log10(voxel_size_m / 100.0))
+
+        def length(value: float) -> float:
+            return round(value, digits) + 0.0
+
+        def of(name: str, value: float) -> float:
+            if name == "volume_m3":
+                return value
+            return round(value, 4) if name == "heading_rad" else length(value)
+
+        return replace(
+            self,
+            length_m=length(self.length_m),
+            width_m=length(self.width_m),
+            height_m=length(self.height_m),
+            heading_rad=round(self.heading_rad, 4) % math.pi,
+            position_m=(length(self.position_m[0]), length(self.position_m[1])),
+            hull_top_m=length(self.hull_top_m),
+            intervals={name: (of(name, low), of(name, high)) for name, (low, high) in self.intervals.items()},
+        )
 
 
 def measure(mesh: trimesh.Trimesh) -> Dimensions:

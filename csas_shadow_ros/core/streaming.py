@@ -20,18 +20,18 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from .arcs import TOLERANCE_RAD, Arc, Arcs
-from .carving import Carver
 from .errors import GeometryError, NoTargetError, ViewError
 from .geometry import TWO_PI, CoherentImage, Track
 from .parameters import PipelineParameters, SubApertureParameters, TargetParameters
+from .search.decision import MAX_OBJECTS, Decision, decide_by_image
 from .sector import Sector, unlike
 from .subaperture import Spectrum, SubApertures
-from .target import choose_target, find_target, spectrum_sign_evidence
-from .threads import in_order
-from .volume import Target, Volume, VoxelGrid
+from .volume import Target, VoxelGrid
 
 if TYPE_CHECKING:
     from .pipeline import ProcessedView
+    from .reconstruction import Reconstruction
+    from .shape.result import Result
 
 #: Sectors share so much at their common edge that rounding leaves no bin to neither.
 _EDGE_RAD = 1e-4
@@ -299,15 +299,16 @@ class Stream:
         *,
         first_search_deg: float = 120.0,
         workers: int = 2,
+        max_objects: int = MAX_OBJECTS,
     ) -> None:
         self.parameters = sub_aperture or SubApertureParameters()
         self.target_parameters = target or TargetParameters()
         self.sum = SectorSum(workers)
         self.track: Track | None = None
         self.sub_apertures: SubApertures | None = None
-        #: Whether `target` has been decided on, for the time being or for good.
-        self.target_known = False
-        self.target: Target | None = None
+        self.max_objects = max_objects
+        #: What is carved, for the time being or for good; None before it is decided on.
+        self.decision: Decision | None = None
         #: Whether target and views are those of the whole run.
         self.final = False
         self.revision = 0
@@ -320,6 +321,16 @@ class Stream:
         self._all_here = False
         self._stale = False
         self._search_at_rad = math.radians(first_search_deg)
+
+    @property
+    def target_known(self) -> bool:
+        """Whether it has been decided on, for the time being or for good, what is carved."""
+        return self.decision is not None
+
+    @property
+    def target(self) -> Target | None:
+        """What the run is about; None where that is not known, or nothing is there."""
+        return None if self.decision is None else self.decision.target
 
     def take_track(self, track: Track) -> bool:
         """Take the track, or a longer one; False if it is not longer."""
@@ -422,16 +433,17 @@ class Stream:
     def _is_whole(self, aspect_rad: float) -> bool:
         return self.sum.arcs.cover(self._arc_of(aspect_rad).widened(self.sum.margin_rad))
 
-    def _given_whole(self) -> Target | None:
-        p = self.target_parameters
-        if p.target == "given" and all(s > 0 for s in p.size_m):
-            return find_target(self.sum.frame, self.track, p, spectrum=self.sum.spectrum)  # type: ignore[arg-type]
-        return None
+    def _decided(self, track: Track, *, check_sign: bool) -> Decision:
+        sub_aperture = replace(self.parameters, check_sign=check_sign)
+        p = PipelineParameters(sub_aperture=sub_aperture, target=self.target_parameters)
+        frame, spectrum = self.sum.frame, self.sum.spectrum
+        return decide_by_image(frame, track, p, spectrum=spectrum, max_objects=self.max_objects)
 
     def _decide_for_now(self, track: Track) -> None:
         """Take a given target, or look for one in the arc that is there."""
-        if (given := self._given_whole()) is not None:
-            self.target_known, self.target = True, given
+        p = self.target_parameters
+        if p.target == "given" and all(s > 0 for s in p.size_m):
+            self.decision = self._decided(track, check_sign=False)
             return
         if self.sum.arcs.covered_rad < self._search_at_rad - TOLERANCE_RAD:
             return
@@ -440,31 +452,20 @@ class Stream:
         if part is None:
             return
         try:
-            self.target = find_target(
-                self.sum.frame, part, self.target_parameters, spectrum=self.sum.spectrum
-            )
+            found = self._decided(part, check_sign=False)
         except NoTargetError:
             return  # nothing is there as far as this arc tells
-        self.target_known = self.target is not None
+        if found.target is not None:
+            self.decision = found
 
     def _decide(self, track: Track) -> None:
         """Find the target of the whole run; what was made for another one is due again."""
-        frame, spectrum, p = self.sum.frame, self.sum.spectrum, self.target_parameters
-        if self.parameters.check_sign:
-            sign, search = spectrum_sign_evidence(frame, track, spectrum=spectrum)
-            sign.check()
-            target = choose_target(search, p)
-        else:
-            target = find_target(frame, track, p, spectrum=spectrum)
-        moved = self.target_known and _place(target) != _place(self.target)
+        before, decision = self.decision, self._decided(track, check_sign=self.parameters.check_sign)
+        moved = before is not None and not before.same_target(decision)
         if self._given and (moved or self._stale):
             self.revision += 1
             self._given.clear()
-        self.target_known, self.target, self.final, self._stale = True, target, True, False
-
-
-def _place(target: Target | None) -> object:
-    return None if target is None else (target.position_m, target.size_m)
+        self.decision, self.final, self._stale = decision, True, False
 
 
 class StreamedRun:
@@ -478,6 +479,8 @@ class StreamedRun:
         See `Stream`.
     workers : int
         Threads.
+    max_objects : int
+        At most so many bodies are carved, the target among them.
     """
 
     def __init__(
@@ -486,13 +489,17 @@ class StreamedRun:
         *,
         first_search_deg: float = 120.0,
         workers: int = 2,
+        max_objects: int = MAX_OBJECTS,
     ) -> None:
-        self.parameters = parameters or PipelineParameters()
-        p = self.parameters
-        self.stream = Stream(p.sub_aperture, p.target, first_search_deg=first_search_deg, workers=workers)
-        self.carver: Carver | None = None
-        #: Reason for each stamp whose view could not be used.
-        self.rejected: dict[int, str] = {}
+        p = self.parameters = parameters or PipelineParameters()
+        self.stream = Stream(
+            p.sub_aperture,
+            p.target,
+            first_search_deg=first_search_deg,
+            workers=workers,
+            max_objects=max_objects,
+        )
+        self.reconstruction: Reconstruction | None = None
         self._workers = workers
         self._revision = 0
 
@@ -513,36 +520,38 @@ class StreamedRun:
 
     def _advance(self) -> list[ProcessedView]:
         # Late: whoever takes a `Stream` alone, as the node does that all others wait for, needs none of it.
-        from .pipeline import process_view
+        from .pipeline import process
+        from .reconstruction import Reconstruction
 
         stream, p = self.stream, self.parameters
-        due = stream.update()
-        target, sub_apertures = stream.target, stream.sub_apertures
-        if target is None or sub_apertures is None:
+        due = [stream.aspect_of(stamp) for stamp in stream.update()]
+        decision, sub_apertures, track = stream.decision, stream.sub_apertures, stream.track
+        if decision is None or sub_apertures is None or track is None:
             return []
-        if self.carver is None or stream.revision != self._revision:
-            self._revision, self.rejected = stream.revision, {}
-            volume = Volume.around(target.position_m, target.size_m, p.carving.voxel_size_m)
-            self.carver = Carver(volume, p.carving)
-
-        def make(stamp: int) -> ProcessedView | ViewError:
-            try:
-                return process_view(sub_apertures, stream.aspect_of(stamp), target, p)
-            except ViewError as error:
-                return error
-
-        made = []
-        for stamp, view in in_order(make, due, self._workers):
-            try:
-                if isinstance(view, ViewError):
-                    raise view
-                self.carver.integrate(view.carves(p.carving))
-            except ViewError as error:
-                self.rejected[stamp] = str(error)
-                continue
-            made.append(view)
+        if self.reconstruction is None or stream.revision != self._revision:
+            self._revision = stream.revision
+            self.reconstruction = Reconstruction(decision, p, run_ns=int(track.stamps_ns[0]))
+        self.reconstruction.settle(decision)
+        made: list[ProcessedView] = []
+        self.reconstruction.feed(
+            due,
+            lambda aspect: process(sub_apertures.view_of_aspect(aspect), "sub_aperture", decision, p),
+            on_view=made.append,
+            workers=self._workers,
+        )
+        if stream.final:
+            for aspect, reason in stream.refused.items():
+                self.reconstruction.refuse(aspect, reason)
         return made
 
     def grid(self) -> VoxelGrid | None:
         """Return the grid as it is; None before the first view."""
-        return self.carver.grid() if self.carver is not None and self.carver.stamps else None
+        return self.result().grid
+
+    def result(self, *, final: bool | None = None) -> Result:
+        """Say what there is by now; by default in full once the run is over."""
+        from .shape.result import Result
+
+        if self.reconstruction is None:
+            return Result(final=False)
+        return self.reconstruction.result(final=self.stream.final if final is None else final)

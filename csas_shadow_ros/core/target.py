@@ -25,7 +25,6 @@ from .parameters import (
     LikelihoodParameters,
     ShadowParameters,
     SubApertureParameters,
-    TargetParameters,
 )
 from .shadow import enhance
 from .subaperture import Spectrum, SubApertures
@@ -187,91 +186,10 @@ def _views_of_search(sub_apertures: SubApertures, workers: int = 2) -> list[View
         return [v for v in pool.map(view, map(float, sub_apertures.aspects_rad)) if v is not None]
 
 
-def _search_image(image: CoherentImage, track: Track, spectrum: Spectrum) -> Search | None:
+def search_image(image: CoherentImage, track: Track, spectrum: Spectrum) -> Search | None:
+    """Look for bodies in a coherent image; None where the track leaves no view to look in."""
     views = _views_of_search(_searching(image, track, spectrum))
     return search_views(views) if views else None
-
-
-def find_target(
-    image: CoherentImage,
-    track: Track,
-    parameters: TargetParameters | None = None,
-    *,
-    spectrum: Spectrum | None = None,
-) -> Target | None:
-    """Find the most evident body in a coherent image, or take the position that is given.
-
-    Parameters
-    ----------
-    image, track : CoherentImage, Track
-        The run.
-    parameters : TargetParameters
-        A given position, or `auto`; a given size of the volume, or automatic.
-    spectrum : Spectrum, optional
-        The image's spectrum, if it was made before.
-
-    Returns
-    -------
-    Target or None
-        None: there is no object.
-    """
-    return find_target_and_others(image, track, parameters, spectrum=spectrum)[0]
-
-
-def find_target_and_others(
-    image: CoherentImage,
-    track: Track,
-    parameters: TargetParameters | None = None,
-    *,
-    spectrum: Spectrum | None = None,
-) -> tuple[Target | None, Search | None]:
-    """Find the target as `find_target` does, and return the search that it was found in.
-
-    Returns
-    -------
-    Target or None
-        None: there is no object.
-    Search or None
-        None: the target was given whole, or there was no view to look in.
-    """
-    p = parameters or TargetParameters()
-    size = p.size_m
-    if p.target == "given" and all(s > 0 for s in size):
-        return Target((p.position_m[0], p.position_m[1]), (size[0], size[1], size[2])), None
-    search = _search_image(image, track, spectrum or Spectrum.of_image(image))
-    return choose_target(search, p), search
-
-
-def choose_target(search: Search | None, parameters: TargetParameters) -> Target | None:
-    """Choose among what the search found: the most evident body, or the one at the given position.
-
-    Raises
-    ------
-    NoTargetError
-        If a position is given, its volume's size is automatic, and no body is there.
-    """
-    p = parameters
-    found = list(search.targets) if search else []
-    if p.target == "given":
-        here = [t for t in found if _covers(t, p.position_m)]
-        if not here:
-            raise NoTargetError(
-                f"no object at the given position ({p.position_m[0]:g}, {p.position_m[1]:g}) m;"
-                " expected one, or size_m given too"
-            )
-        target = replace(here[0], position_m=(p.position_m[0], p.position_m[1]))
-    elif found:
-        target = found[0]
-    else:
-        return None
-    size = tuple(given or auto for given, auto in zip(p.size_m, target.size_m, strict=True))
-    return replace(target, size_m=(size[0], size[1], size[2]))
-
-
-def _covers(target: Target, position_m: tuple[float, ...]) -> bool:
-    return all(
-        abs(p - t) <= s / 2 for p, t, s in zip(position_m, target.position_m, target.size_m, strict=False)
-    )
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from msg_adapters.voxels import voxels_to_msg
 
 from ..bags import BagReader, BagWriter
 from ..core.geometry import Acoustics, CoherentImage, Track, View
-from ..core.pipeline import Result
+from ..core.shape.result import Result
 
 _LATCHED = ("image", "camera_info", "track", "target", "mesh", "voxels")
 _LATCHED_STREAMS = ("multilook", "color_by_aspect", "voxel_grid", "voxel_views")

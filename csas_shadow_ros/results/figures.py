@@ -36,7 +36,7 @@ from ..core.mesh import surface_field
 from ..core.shadow import enhance
 from ..core.subaperture import Spectrum, SubApertures
 from ..core.volume import VoxelGrid
-from .subject import SIX_ASPECTS_DEG, AnyView, Subject
+from .subject import SIX_ASPECTS_DEG, ProcessedView, Subject
 
 #: Levels shown, dB over the median.
 _DB_LOW, _DB_HIGH = -20.0, 20.0
@@ -339,22 +339,22 @@ def figure_6(subject: Subject) -> Figure:
     return _six(subject, "shadow", "Shadow enhanced sub-apertures")
 
 
-def _example(subject: Subject) -> AnyView:
+def _example(subject: Subject) -> ProcessedView:
     """Return the kept view with the largest segmented shadow."""
     views = [v for v in subject.keeper.views() if v.shadow is not None and v.mask is not None]
     if not views or subject.result.target is None:
         raise _Missing("there is no target, so no shadow to look at")
 
-    def dark(view: AnyView) -> int:
+    def dark(view: ProcessedView) -> int:
         return 0 if view.mask is None else int((view.mask.pixels == MASK_SHADOW).sum())
 
     return max(views, key=dark)
 
 
-def _most_enhanced(subject: Subject) -> AnyView:
+def _most_enhanced(subject: Subject) -> ProcessedView:
     """Return the kept view whose segmented shadow enhancement has darkened most."""
 
-    def gain(view: AnyView) -> float:
+    def gain(view: ProcessedView) -> float:
         full, shadow, mask = view.sub_aperture, view.shadow, view.mask
         if full is None or shadow is None or mask is None:
             return -math.inf

@@ -18,11 +18,12 @@ from ..bags import BagReader
 from ..core.errors import CsasError
 from ..core.geometry import CoherentImage, Track, View
 from ..core.mesh import measure, mesh_from_grid
-from ..core.pipeline import Result
+from ..core.pipeline import ProcessedView
+from ..core.shape.result import Result
 from ..core.volume import Volume, VoxelGrid
 from .bag import ResultBag
 from .report import FORMAT, Context, build_report, report_text, summary
-from .subject import AnyView, Keeper, Subject
+from .subject import Keeper, Subject
 from .truth import score
 
 if TYPE_CHECKING:
@@ -84,8 +85,6 @@ class ResultsWriter:
         self._bag = ResultBag(self._work) if bag else None
         self._figures = figures
         self._keeper = Keeper()
-        self._aspects_deg: dict[int, float] = {}
-        self._sonar_m: dict[int, Any] = {}
         #: Where things may lie that are moved or removed before the folder is finished.
         self.work = self._work
         #: Seconds spent in writing views.
@@ -124,7 +123,7 @@ class ResultsWriter:
         if self._bag is not None:
             self._bag.write_source(image, track, reader)
 
-    def add_view(self, view: AnyView) -> None:
+    def add_view(self, view: ProcessedView) -> None:
         """Take one processed view: the `on_view` of `pipeline.run` and `stages.run_views`."""
         start = time.perf_counter()
         self.show_view(view)
@@ -132,21 +131,13 @@ class ResultsWriter:
             one: View | None = getattr(view, attribute)
             if one is None:
                 continue
-            self.note_view(one)
             if self._bag is not None:
                 self._bag.write_view(one, stream)
         self.view_seconds += time.perf_counter() - start
 
-    def show_view(self, view: AnyView) -> None:
+    def show_view(self, view: ProcessedView) -> None:
         """Take one processed view for the figures alone."""
         self._keeper.add(view)
-
-    def note_view(self, view: View) -> None:
-        """Note where a view looked and where its sonar was."""
-        stamp = view.info.stamp_ns
-        if stamp not in self._aspects_deg:
-            self._aspects_deg[stamp] = float(np.degrees(view.info.aspect_rad) % 360.0)
-            self._sonar_m[stamp] = view.info.camera.sonar_m
 
     def adopt_bag(self, recording: Path) -> None:
         """Take a recording of the node graph as ``result.mcap``."""
@@ -217,8 +208,9 @@ class ResultsWriter:
             _, left_out = draw_all(subject, work / "figures")
             lap("figures")
         scores = None
-        if truth is not None and truth.dimensions is not None and result.grid is not None and self._sonar_m:
-            scores = score(truth, result.grid, np.array(list(self._sonar_m.values())), result.matter)
+        if truth is not None and truth.dimensions is not None and result.grid is not None and result.evidence:
+            sonar = np.array([one.sonar_m for one in result.evidence.values()])
+            scores = score(truth, result.grid, sonar, result.matter)
             lap("scores")
         other = result.other_grid
         other_dimensions = (
@@ -228,7 +220,6 @@ class ResultsWriter:
         report = build_report(
             result,
             context,
-            aspects_deg=self._aspects_deg,
             scores=scores,
             other=other_dimensions,
             files=[*files, REPORT, "summary.txt"],

@@ -18,10 +18,10 @@ import numpy as np
 
 from .. import __version__
 from ..core.geometry import CoherentImage, Track
-from ..core.measurement import shadow_height
 from ..core.mesh import Dimensions
 from ..core.parameters import CarvingParameters, PipelineParameters
-from ..core.pipeline import Result
+from ..core.shape.result import Result, ViewEvidence
+from ..core.shape.verdict import no_object_reason
 from ..core.threshold import thresholded
 from ..core.volume import VoxelGrid
 from .truth import KnownTruth
@@ -193,37 +193,36 @@ def _sensitivity(grid: VoxelGrid | None, parameters: CarvingParameters) -> list[
 
 def _shadow_heights(result: Result) -> dict[str, Any] | None:
     """Return the height that each view's shadow length implies."""
-    if result.dimensions is None or not result.sides:
+    told = [one for _, one in sorted(result.evidence.items()) if math.isfinite(one.height_m)]
+    if not told:
         return None
-    heights = [(side.info, shadow_height(side, result.dimensions)) for side in result.sides]
     return {
         "formula": "z = s_z (tip - top) / (s + tip), down-range from the origin; top: far side of the plan",
-        "median_m": float(np.median([height for _, height in heights])),
+        "median_m": float(np.median([one.height_m for one in told])),
         "by_view": [
             {
-                "aspect_deg": math.degrees(info.aspect_rad) % 360.0,
-                "stamp_ns": info.stamp_ns,
-                "height_m": height,
+                "aspect_deg": math.degrees(one.aspect_rad) % 360.0,
+                "stamp_ns": one.stamp_ns,
+                "height_m": one.height_m,
             }
-            for info, height in sorted(heights, key=lambda pair: pair[0].stamp_ns)
+            for one in told
         ],
     }
 
 
-def _levels(
-    levels: Mapping[int, tuple[float, float, bool]], aspects_deg: Mapping[int, float]
-) -> dict[str, Any]:
+def _levels(evidence: Mapping[int, ViewEvidence]) -> dict[str, Any]:
     """Summarise σ_r, σ_s and contrast, overall and by view."""
     views = [
         {
             "stamp_ns": stamp,
-            "aspect_deg": aspects_deg.get(stamp),
-            "sigma_r": sigma_r,
-            "sigma_s": sigma_r / contrast,
-            "contrast_db": 20.0 * math.log10(contrast),
-            "estimated": estimated,
+            "aspect_deg": math.degrees(one.aspect_rad) % 360.0,
+            "sigma_r": one.seabed_level,
+            "sigma_s": one.seabed_level / one.contrast,
+            "contrast_db": 20.0 * math.log10(one.contrast),
+            "estimated": one.levels_estimated,
         }
-        for stamp, (sigma_r, contrast, estimated) in sorted(levels.items())
+        for stamp, one in sorted(evidence.items())
+        if math.isfinite(one.contrast)
     ]
     overall: dict[str, Any] = {"views": len(views), "estimated": sum(bool(v["estimated"]) for v in views)}
     for name in ("sigma_r", "sigma_s", "contrast_db"):
@@ -249,14 +248,6 @@ def _slope(grid: VoxelGrid | None) -> dict[str, Any] | None:
 
 def _sign(result: Result, context: Context) -> dict[str, Any]:
     override = context.spectrum_sign_override
-    if result.sign is None and context.nodes is not None and context.image is not None:
-        checked = context.parameters.sub_aperture.check_sign
-        return {
-            "stated": context.image.acoustics.spectrum_sign,
-            "verdict": "not contradicted" if checked else "not checked",
-            "why": "node sub_aperture found no contradiction" if checked else "check_sign is off",
-            "override": override,
-        }
     if result.sign is None:
         why = "there is no image to check it on" if context.image is None else "check_sign is off"
         stated = context.image.acoustics.spectrum_sign if context.image is not None else None
@@ -275,7 +266,6 @@ def build_report(
     result: Result,
     context: Context,
     *,
-    aspects_deg: Mapping[int, float],
     scores: Mapping[str, float] | None,
     other: Dimensions | None,
     files: Sequence[str],
@@ -287,8 +277,6 @@ def build_report(
     ----------
     result, context : Result, Context
         What was found, and of what.
-    aspects_deg : mapping of int to float
-        Aspect of each view by its stamp.
     scores : mapping, optional
         Against the truth (`truth.score`).
     other : Dimensions, optional
@@ -313,7 +301,11 @@ def build_report(
     report = {
         "format": FORMAT,
         "object": found,
-        "verdict": "object found" if found else no_object_reason(result),
+        "verdict": result.verdict,
+        "quality": {"verdict": result.quality.verdict, "reasons": list(result.quality.reasons)},
+        "why_no_object": None if result.objects else no_object_reason(result),
+        "run": result.run_ns,
+        "arc_deg": math.degrees(result.arc_rad),
         "objects": _objects(result),
         "objects_left_out": result.left_out,
         "method": context.parameters.carving.method,
@@ -335,7 +327,7 @@ def build_report(
             "reasons": _reasons(result.rejected.values()),
             "rejected_by_aspect_deg": {f"{a:g}": r for a, r in sorted(result.rejected.items())},
         },
-        "levels": _levels(result.levels, aspects_deg),
+        "levels": _levels(result.evidence),
         "spectrum_sign": _sign(result, context),
         "timings_s": {**result.timings_s, **context.timings_s},
         "stage": context.stage,
@@ -354,15 +346,6 @@ def build_report(
     return ready
 
 
-def no_object_reason(result: Result) -> str:
-    """Say why there is no object."""
-    if result.target is None:
-        return "no object: nothing casts a shadow of its own from all sides"
-    if not result.views_used:
-        return "no object: no view of the target was usable"
-    return "no object: no voxel of the carved volume lies in shadow from all sides"
-
-
 def _reasons(reasons: Iterable[str]) -> dict[str, int]:
     """Count reasons that differ in nothing but numbers together, under the first of them."""
     first: dict[str, str] = {}
@@ -378,12 +361,22 @@ def report_text(report: Mapping[str, Any]) -> str:
     return json.dumps(report, indent=2, allow_nan=False) + "\n"
 
 
+def headline(report: Mapping[str, Any]) -> str:
+    """Say in a few words what was found, and how far that can be trusted."""
+    quality = report.get("quality") or {"verdict": "good"}  # reports of before this entry have none
+    text = str(report["verdict"])
+    if report.get("why_no_object") and report["verdict"] == "no object":
+        text += f": {report['why_no_object']}"
+    return text if quality["verdict"] == "good" else f"{text} ({quality['verdict']})"
+
+
 def summary(report: Mapping[str, Any]) -> str:
     """Write the short table that is printed and kept as ``summary.txt``."""
     truth = report["truth"] or {}
     true = truth.get("dimensions") or {}
     mine = report["dimensions"] or {}
-    lines = [f"csas-shadow {report['versions']['csas_shadow_ros']}: {report['verdict']}", ""]
+    quality = report.get("quality") or {"verdict": "good", "reasons": []}
+    lines = [f"csas-shadow {report['versions']['csas_shadow_ros']}: {headline(report)}", ""]
     if truth and not mine and not truth["object"]:
         lines[0] += " (as is true)"
     elif truth and bool(mine) != truth["object"]:
@@ -426,6 +419,7 @@ def summary(report: Mapping[str, Any]) -> str:
             f"IoU against the truth {s['iou_truth']:.3f}, against its shadow hull {s['iou_hull']:.3f}"
             f" (the hull itself: {s['iou_hull_truth']:.3f})"
         )
+    lines += [f"{quality['verdict']}: {reason}" for reason in quality["reasons"]]
     hollows = report.get("hollows")
     if hollows and hollows["voxels"]:
         line = f"hollows that no shadow shows, but echoes do: {hollows['volume_m3']:.4f} m³"

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from ..core.geometry import CoherentImage, Track, View, wrap_angle
-from ..core.likelihood import Levels
 from ..core.parameters import PipelineParameters
-from ..core.pipeline import Result
+from ..core.pipeline import ProcessedView
+from ..core.shape.result import Result
 
 if TYPE_CHECKING:
     import trimesh
@@ -18,29 +18,14 @@ if TYPE_CHECKING:
 SIX_ASPECTS_DEG = (20.0, 80.0, 140.0, 200.0, 260.0, 320.0)
 
 
-class AnyView(Protocol):
-    """A view with what is known of its stages: `ProcessedView` or `StagedView`."""
-
-    @property
-    def sub_aperture(self) -> View | None: ...
-    @property
-    def shadow(self) -> View | None: ...
-    @property
-    def levels(self) -> Levels | None: ...
-    @property
-    def likelihood(self) -> View | None: ...
-    @property
-    def mask(self) -> View | None: ...
-
-
 @dataclass(eq=False)
 class Keeper:
     """Keeps the views that the figures show, of all that come by: those nearest to six aspects."""
 
     aspects_deg: tuple[float, ...] = SIX_ASPECTS_DEG
-    kept: dict[float, tuple[float, AnyView]] = field(default_factory=dict)
+    kept: dict[float, tuple[float, ProcessedView]] = field(default_factory=dict)
 
-    def add(self, view: AnyView) -> None:
+    def add(self, view: ProcessedView) -> None:
         """Look at one view and keep it if it is the nearest so far to one of the aspects."""
         any_stage = view.shadow or view.sub_aperture or view.likelihood or view.mask
         if any_stage is None:
@@ -50,7 +35,7 @@ class Keeper:
             if off < math.pi / len(self.aspects_deg) and off < self.kept.get(aspect, (math.inf, view))[0]:
                 self.kept[aspect] = (off, view)
 
-    def views(self) -> list[AnyView]:
+    def views(self) -> list[ProcessedView]:
         """Return what was kept, in order of aspect."""
         return [self.kept[a][1] for a in self.aspects_deg if a in self.kept]
 

@@ -1,12 +1,27 @@
-"""What is to be carved: the one decision that every run takes, from whatever it has."""
+"""What is to be carved: the one decision that every run takes, whatever it has to look at."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 
+from ..errors import NoTargetError, ViewError
+from ..geometry import TWO_PI, CoherentImage, Track, View, fit_target_to_focus, wrap_angle
+from ..parameters import PipelineParameters, ShadowParameters, TargetParameters
+from ..shadow import enhance
 from ..shape.result import LeftOut
-from ..target import SignEvidence
+from ..subaperture import Spectrum
+from ..target import Search, SignEvidence, search_image, search_views, spectrum_sign_evidence
 from ..volume import Target
+
+#: Bodies carved if nothing else is asked for, the target among them. Each further one takes about half
+#: of the target's time.
+MAX_OBJECTS = 4
+#: More than this are refused: their views would not fit into memory.
+MOST_OBJECTS = 64
+#: How many views from all round look for the target: one every 10°, as the search in an image makes them.
+_SEARCH_VIEWS = 36
+PHANTOM = "a phantom: shadows of other bodies cross over it, and it does not reach down to the seabed"
 
 
 @dataclass(frozen=True)
@@ -29,3 +44,182 @@ class Decision:
     others: tuple[Target, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
     sign: SignEvidence | None = None
+
+    def same_target(self, other: Decision) -> bool:
+        """Say whether views made for one decision serve the other: the same volumes are carved."""
+        return [_place(t) for t in (self.target, *self.others)] == [
+            _place(t) for t in (other.target, *other.others)
+        ]
+
+
+def _place(target: Target | None) -> object:
+    return None if target is None else (target.position_m, target.size_m)
+
+
+def decide(
+    search: Search | None,
+    parameters: TargetParameters,
+    sign: SignEvidence | None = None,
+    max_objects: int = MAX_OBJECTS,
+    beyond: str = "no more than {max_objects} bodies are carved",
+) -> Decision:
+    """Choose among what a search found.
+
+    Parameters
+    ----------
+    search : Search or None
+        None: nothing was looked at.
+    parameters : TargetParameters
+        ``auto``: the most evident body is the target, and what else stands on the seabed is carved too.
+        ``given``: the one at that position is, alone; with its size given it need not be found.
+    sign : SignEvidence, optional
+        Whether the shadows fit the stated spectrum sign.
+    max_objects : int
+        At most so many bodies are carved, the target among them.
+    beyond : str
+        Why no more are.
+
+    Raises
+    ------
+    SpectrumSignError
+        If the shadows contradict the stated spectrum sign.
+    NoTargetError
+        If a position is given, its volume's size is automatic, and no body is there.
+    """
+    if sign is not None:
+        sign.check()
+    p, found = parameters, search.targets if search is not None else ()
+    if p.target == "given":
+        return Decision(_given(found, p), sign=sign)
+    if not found:
+        return Decision(None, sign=sign)
+    others: list[Target] = []
+    left_out = []
+    for body in found[1:]:
+        if not body.stands:
+            left_out.append(LeftOut(body.position_m, PHANTOM))
+        elif len(others) + 1 >= max_objects:
+            left_out.append(LeftOut(body.position_m, beyond.format(max_objects=max_objects)))
+        else:
+            others.append(body)
+    return Decision(_sized(found[0], p), tuple(others), tuple(left_out), sign)
+
+
+def _given(found: Iterable[Target], p: TargetParameters) -> Target:
+    position = (p.position_m[0], p.position_m[1])
+    here = [t for t in found if _covers(t, position)]
+    if here:
+        return _sized(replace(here[0], position_m=position), p)
+    if all(s > 0 for s in p.size_m):
+        return Target(position, (p.size_m[0], p.size_m[1], p.size_m[2]))
+    raise NoTargetError(
+        f"no object at the given position ({position[0]:g}, {position[1]:g}) m;"
+        " expected one, or size_m given too"
+    )
+
+
+def _sized(target: Target, p: TargetParameters) -> Target:
+    size = tuple(given or auto for given, auto in zip(p.size_m, target.size_m, strict=True))
+    return replace(target, size_m=(size[0], size[1], size[2]))
+
+
+def _covers(target: Target, position_m: tuple[float, float]) -> bool:
+    return all(
+        abs(p - t) <= s / 2 for p, t, s in zip(position_m, target.position_m, target.size_m, strict=False)
+    )
+
+
+def decide_by_image(
+    image: CoherentImage,
+    track: Track,
+    parameters: PipelineParameters,
+    *,
+    spectrum: Spectrum,
+    max_objects: int = MAX_OBJECTS,
+) -> Decision:
+    """Decide by the full-circle image, or by as much of it as the track covers.
+
+    `parameters.sub_aperture.check_sign` says whether the spectrum's sign is checked. Errors: see `decide`.
+    """
+    p = parameters.target
+    if parameters.sub_aperture.check_sign:
+        sign, search = spectrum_sign_evidence(image, track, spectrum=spectrum)
+        return decide(search, p, sign, max_objects)
+    given = p.target == "given" and all(s > 0 for s in p.size_m)
+    return decide(None if given else search_image(image, track, spectrum), p, None, max_objects)
+
+
+def decide_by_views(
+    views: Callable[[], Iterable[View]],
+    stage: str,
+    parameters: TargetParameters | None = None,
+    max_objects: int = MAX_OBJECTS,
+) -> Decision:
+    """Decide by views of a stage.
+
+    Parameters
+    ----------
+    views : callable
+        Gives the views from the beginning, each time that it is called.
+    stage : str
+        ``sub_aperture`` or ``shadow``; likelihoods and masks do not tell where the target is.
+    parameters : TargetParameters
+        Position and size, or automatic.
+    max_objects : int
+        At most so many bodies are carved; of ``shadow`` views one, on which they are focused.
+
+    Raises
+    ------
+    NoTargetError
+        If there is no view, nothing is at the given position, or the stage's views (likelihood, mask) cannot
+        tell where the target is and it is not given whole.
+    """
+    p = parameters or TargetParameters()
+    if p.target == "given" and all(s > 0 for s in p.size_m):
+        return decide(None, p)
+    chosen = spread_views(views(), _SEARCH_VIEWS)
+    if stage in ("likelihood", "shadow_mask"):
+        try:
+            x, y = fit_target_to_focus([view.info for view in chosen])
+            hint = f" (its views were focused on ({x:.2f}, {y:.2f}) m)"
+        except ValueError:
+            hint = ""
+        raise NoTargetError(
+            f"{stage} views do not tell how large the target is; expected target: given with position_m and"
+            f" size_m{hint}"
+        )
+    unfocused = ShadowParameters(enhancement="none")
+    amplitudes = []
+    for view in chosen:
+        try:
+            amplitudes.append(enhance(view, (0.0, 0.0), unfocused) if stage == "sub_aperture" else view)
+        except ViewError:
+            continue  # named again, with its aspect, when it should be carved with
+    search = search_views(amplitudes)
+    if stage == "shadow":
+        return decide(search, p, None, 1, "shadow views are focused on the target alone")
+    return decide(search, p, None, max_objects)
+
+
+def spread_views(views: Iterable[View], count: int, start_rad: float = 0.0) -> list[View]:
+    """Keep the views nearest to `count` aspects round the circle, each once; memory holds no more.
+
+    Parameters
+    ----------
+    views : iterable of View
+        Any number, in any order.
+    count : int
+        Number of aspects.
+    start_rad : float
+        The first of them; the others follow every 2π/count.
+    """
+    kept: list[tuple[float, View] | None] = [None] * count
+    step = TWO_PI / count
+    for view in views:
+        aspect = view.info.aspect_rad - start_rad
+        slot = round((aspect % TWO_PI) / step) % count
+        off = abs(float(wrap_angle(aspect - slot * step)))
+        best = kept[slot]
+        if best is None or off < best[0]:
+            kept[slot] = (off, view)
+    return [best[1] for best in kept if best is not None]

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     import trimesh
 
     from ..composites import Composites
+    from ..hollows import EchoLook
+    from ..measurement import SilhouetteSides
     from ..target import SignEvidence
 
 #: What a run can find.
@@ -140,6 +142,11 @@ class Result:
         Reason for each aspect (degrees) whose view was not used.
     evidence : dict of ViewEvidence
         What each view in the grid contributed, by stamp.
+    sides : list of SilhouetteSides
+        Where the shadow ends in each view: what the dimensions are measured on. Kept in the process that
+        made the result; a result that was read from topics has none.
+    looks : dict of EchoLook
+        Where each view is dark round the target, by stamp: what hollows are told by. Kept likewise.
     further : list of ObjectResult
         What else stands on the seabed, in the order of the search's evidence.
     left_out : list of LeftOut
@@ -166,6 +173,8 @@ class Result:
     arc_rad: float = 0.0
     rejected: dict[float, str] = field(default_factory=dict)
     evidence: dict[int, ViewEvidence] = field(default_factory=dict)
+    sides: list[SilhouetteSides] = field(default_factory=list)
+    looks: dict[int, EchoLook] = field(default_factory=dict)
     further: list[ObjectResult] = field(default_factory=list)
     left_out: list[LeftOut] = field(default_factory=list)
     timings_s: dict[str, float] = field(default_factory=dict)

@@ -1,0 +1,427 @@
+"""The one thing that views are fed to: it carves, and says what there is.
+
+`pipeline.run`, runs from views or sectors, and node `voxel_carver` all feed a `Reconstruction`, view by view,
+in any order, whole views or the parts of one as they come. Sums are of whole numbers, and what is measured
+goes by the views' stamps: whoever feeds the same views gets the same result.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, TypeVar
+
+from .arcs import Arc, Arcs
+from .carving import Carver, KeptMask
+from .composites import Composites
+from .errors import ViewError
+from .geometry import View, ViewInfo
+from .hollows import EchoLook, matter_mesh, matter_of
+from .likelihood import Levels
+from .measurement import SilhouetteSides, levels_of_mask, measure_object, shadow_height, silhouette_sides
+from .mesh import Dimensions, measure, mesh_from_grid
+from .parameters import PipelineParameters
+from .search.decision import Decision
+from .segmentation import require_silhouette
+from .shape.pieces import objects_of
+from .shape.result import LeftOut, ObjectResult, Result, ViewEvidence
+from .shape.verdict import judge
+from .threads import in_order
+from .volume import Target, Volume, VoxelGrid
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from .pipeline import ProcessedView
+
+Item = TypeVar("Item", float, View)
+
+#: What of a view can be taken in: by which the target is carved, measured, and its hollows told.
+PARTS = ("likelihood", "mask", "levels", "sides", "look")
+#: Views that wait for their silhouette at most, where it comes apart from them: twice the largest window.
+_WAITING = 16
+
+
+class Body:
+    """One body while it is carved.
+
+    Parameters
+    ----------
+    target : Target
+        Its volume.
+    parameters : PipelineParameters
+        Of all stages.
+    compare : bool
+        Carve by the other method too (figure 8).
+    """
+
+    def __init__(
+        self,
+        target: Target,
+        parameters: PipelineParameters,
+        *,
+        compare: bool = False,
+        pool: ThreadPoolExecutor | None = None,
+    ) -> None:
+        p = parameters.carving
+        volume = Volume.around(target.position_m, target.size_m, p.voxel_size_m)
+        self.target = target
+        self.carver = Carver(volume, p, pool=pool)
+        self.other = Carver(volume, p.other(), pool=pool) if compare else None
+        self.infos: dict[int, ViewInfo] = {}
+        self.levels: dict[int, tuple[float, float, bool]] = {}
+        self.sides: dict[int, SilhouetteSides | None] = {}
+        self.looks: dict[int, EchoLook] = {}
+        #: Why the first view that was not usable was not.
+        self.refused = ""
+        self._masks: dict[int, KeptMask] = {}
+        self._waiting: OrderedDict[int, Levels] = OrderedDict()
+
+    def add(self, view: ProcessedView, parts: Collection[str]) -> bool:
+        """Take parts of a view in; say whether it is new to the grid.
+
+        Raises
+        ------
+        ViewError
+            If the grid cannot take it; whatever else of it is there is kept.
+        """
+        likelihood = view.likelihood if "likelihood" in parts else None
+        mask = view.mask if "mask" in parts else None
+        levels = view.levels if "levels" in parts else None
+        info = next((one.info for one in (mask, likelihood, view.shadow) if one is not None), None)
+        if info is None:
+            return False
+        stamp = info.stamp_ns
+        if levels is not None:
+            self.infos.setdefault(stamp, info)
+            self.levels[stamp] = (levels.seabed_level, levels.contrast, levels.estimated)
+            if "look" in parts and view.look is not None:
+                self.looks[stamp] = view.look
+        if mask is not None or levels is not None:
+            self._take_sides(stamp, view, mask, levels)
+        fresh, errors = False, []
+        for carver in (self.carver, self.other):
+            pixels = None if carver is None else mask if carver.parameters.takes_masks else likelihood
+            if carver is None or pixels is None:
+                continue
+            try:
+                if carver.parameters.takes_masks:
+                    require_silhouette(pixels)
+                fresh |= carver.integrate(pixels) and carver is self.carver
+            except ViewError as error:
+                errors += [error] if carver is self.carver else []
+        if errors:
+            raise errors[0]
+        if fresh:
+            self.infos.setdefault(stamp, info)
+        return fresh
+
+    def _take_sides(self, stamp: int, view: ProcessedView, mask: View | None, levels: Levels | None) -> None:
+        """Measure a silhouette's sides once both it and the view's levels are here, whichever comes first."""
+        if self.sides.get(stamp) is not None:
+            return
+        if mask is not None and levels is not None:
+            self.sides[stamp] = view.sides
+        elif mask is not None and (known := self._waiting.pop(stamp, None)) is not None:
+            self.sides[stamp] = silhouette_sides(known, mask, self.target.position_m)
+        elif mask is not None:
+            self._masks[stamp] = KeptMask.of(mask)
+        elif levels is not None and (kept := self._masks.pop(stamp, None)) is not None:
+            self.sides[stamp] = silhouette_sides(levels, kept.view(), self.target.position_m)
+        elif levels is not None:
+            self._waiting[stamp] = levels
+            while len(self._waiting) > _WAITING:
+                self._waiting.popitem(last=False)
+
+    def known_sides(self) -> list[SilhouetteSides]:
+        """Return the sides of the views in the grid; of a silhouette that came alone it tells them itself."""
+        for stamp, kept in self._masks.items():
+            mask = kept.view()
+            self.sides[stamp] = silhouette_sides(levels_of_mask(mask), mask, self.target.position_m)
+        return [s for stamp, s in sorted(self.sides.items()) if s is not None and stamp in self.carver.stamps]
+
+
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """What a body's views say together."""
+
+    grid: VoxelGrid
+    mesh: trimesh.Trimesh | None
+    dimensions: Dimensions | None
+
+
+def _shape_of(grid: VoxelGrid, sides: Sequence[SilhouetteSides], *, final: bool) -> _Shape:
+    """Extract a grid's surface and measure it; with intervals once no more views are to come."""
+    if not grid.occupied.any():
+        return _Shape(grid, None, None)
+    mesh = mesh_from_grid(grid)
+    found = measure_object(grid, mesh, sides) if final else measure(mesh)
+    return _Shape(grid, mesh, found.rounded(grid.volume.voxel_size_m))
+
+
+class Reconstruction:
+    """A scene while its views come in.
+
+    Parameters
+    ----------
+    decision : Decision
+        What is carved.
+    parameters : PipelineParameters
+        Of all stages.
+    compare : bool
+        Carve the target by the other method too.
+    compose : bool
+        Add views to the images of the circle.
+    run_ns : int, optional
+        The run's name: the stamp of its track's first pose.
+    pool : ThreadPoolExecutor, optional
+        Carve the lower and the upper half of a volume at the same time.
+    """
+
+    def __init__(
+        self,
+        decision: Decision,
+        parameters: PipelineParameters | None = None,
+        *,
+        compare: bool = True,
+        compose: bool = True,
+        run_ns: int | None = None,
+        pool: ThreadPoolExecutor | None = None,
+    ) -> None:
+        p = self.parameters = parameters or PipelineParameters()
+        self.decision, self.run_ns = decision, run_ns
+        self.bodies: list[Body] = []
+        if decision.target is not None:
+            self.bodies = [Body(decision.target, p, compare=compare, pool=pool)]
+            self.bodies += [Body(other, p, pool=pool) for other in decision.others]
+        self.arcs = Arcs()
+        self.rejected: dict[float, str] = {}
+        self.composites: Composites | None = None
+        self.timings_s: dict[str, float] = {}
+        self._compose = compose
+
+    @property
+    def stamps(self) -> set[int]:
+        """Stamps of the views in the target's grid."""
+        return self.bodies[0].carver.stamps if self.bodies else set()
+
+    def parts_of(self, number: int) -> tuple[str, ...]:
+        """Return what of a view is needed for a body: of those besides the target no hollows are told."""
+        taken = "mask" if self.parameters.carving.takes_masks else "likelihood"
+        return PARTS if number == 0 else tuple(dict.fromkeys((taken, "mask", "levels", "sides")))
+
+    def add(self, view: ProcessedView, body: int = 0, parts: Collection[str] = PARTS) -> bool:
+        """Take a view in, or some parts of one; say whether it is new to the body's grid.
+
+        Raises
+        ------
+        ViewError
+            If the body's grid cannot take it.
+        """
+        fresh = self.bodies[body].add(view, parts)
+        pixels = view.mask if "mask" in parts else view.likelihood
+        if fresh and body == 0 and pixels is not None:
+            half = pixels.info.aperture_rad / 2.0
+            self.arcs.add(Arc(pixels.info.aspect_rad - half, 2.0 * half))
+        return fresh
+
+    def settle(self, decision: Decision) -> None:
+        """Take the whole run's decision for a provisional one that carves the same volumes."""
+        self.decision = decision
+
+    def refuse(self, aspect_rad: float, reason: str) -> None:
+        """Note that a view could not be used."""
+        self.rejected[round(math.degrees(aspect_rad), 6)] = reason
+
+    def feed(
+        self,
+        items: Iterable[Item],
+        make: Callable[[Item], list[ProcessedView]],
+        total: int = 0,
+        *,
+        progress: Callable[[int, int], None] | None = None,
+        on_view: Callable[[ProcessedView], None] | None = None,
+        workers: int = 2,
+    ) -> int:
+        """Process views in threads and take them in, in order.
+
+        Parameters
+        ----------
+        items : iterable of float or View
+            Aspects (rad), or views.
+        make : callable
+            Takes one of them and gives the view for each body, the target's first.
+        total : int
+            How many there are, for `progress`; 0: unknown.
+        progress, on_view : callable, optional
+            Called with (done, in all), and with every view of the target that was processed.
+        workers : int
+            Threads.
+
+        Returns
+        -------
+        int
+            How many items there were.
+        """
+        began = time.perf_counter()
+
+        def ready(item: Item) -> list[ProcessedView | ViewError] | ViewError:
+            try:
+                views: list[ProcessedView] = make(item)
+                first: ProcessedView | ViewError = _made(views[0], self.parts_of(0))
+                return [first, *(self._made_or_not(n, view) for n, view in enumerate(views[1:], start=1))]
+            except ViewError as error:
+                return error
+
+        done = 0
+        for done, (item, made) in enumerate(in_order(ready, items, workers), start=1):
+            aspect = item.info.aspect_rad if isinstance(item, View) else item
+            if isinstance(made, ViewError):
+                self.refuse(aspect, str(made))
+            else:
+                self._take(made, aspect)
+                if on_view and self.bodies and not isinstance(made[0], ViewError):
+                    on_view(made[0])
+            if progress:
+                progress(done, max(total, done))
+        self.timings_s["views"] = time.perf_counter() - began
+        return done
+
+    def _made_or_not(self, number: int, view: ProcessedView) -> ProcessedView | ViewError:
+        try:
+            return _made(view, self.parts_of(number))
+        except ViewError as error:
+            return error
+
+    def _take(self, views: list[ProcessedView | ViewError], aspect_rad: float) -> None:
+        first = views[0]
+        if self._compose and not isinstance(first, ViewError):
+            self.compose(first.sub_aperture or first.shadow)
+        for number, view in enumerate(views if self.bodies else ()):
+            try:
+                if isinstance(view, ViewError):
+                    raise view
+                self.add(view, number, self.parts_of(number))
+            except ViewError as error:
+                body = self.bodies[number]
+                body.refused = body.refused or str(error)
+                if number == 0:
+                    self.refuse(aspect_rad, str(error))
+
+    def compose(self, view: View | None) -> None:
+        """Add a view to the images of the circle."""
+        if view is None:
+            return
+        if self.composites is None:
+            self.composites = Composites.for_view(view)
+        self.composites.integrate(view)
+
+    def result(self, *, final: bool = True) -> Result:
+        """Say what there is.
+
+        Parameters
+        ----------
+        final : bool
+            Whether no more views are to come. Until then carving looks once, and nothing is said of
+            intervals, hollows and further bodies: a few ms instead of a second.
+        """
+        began = time.perf_counter()
+        result = Result(
+            run_ns=self.run_ns,
+            stamp_ns=max(self.stamps, default=0),
+            final=final,
+            target=self.decision.target,
+            sign=self.decision.sign,
+            composites=self.composites,
+            views_used=len(self.stamps),
+            arc_rad=self.arcs.covered_rad,
+            rejected=dict(self.rejected),
+            left_out=list(self.decision.left_out),
+            timings_s=dict(self.timings_s),
+        )
+        if self.stamps:
+            self._shape(result, self.bodies[0], final=final)
+        result.timings_s["shape"] = time.perf_counter() - began
+        if final and result.mesh is not None and result.looks:
+            self._open_hollows(result)
+        result.timings_s["hollows"] = time.perf_counter() - began - result.timings_s["shape"]
+        if final and len(self.bodies) > 1:
+            for body in self.bodies[1:]:
+                self._add_objects(result, body)
+            result.timings_s["objects"] = time.perf_counter() - began - sum(
+                result.timings_s[step] for step in ("shape", "hollows")
+            )
+        judge(result)
+        return result
+
+    def _shape(self, result: Result, body: Body, *, final: bool) -> None:
+        """Give the result the target's grid, surface and measures, and what each view told."""
+        grid = body.carver.grid() if final else body.carver.first_look()
+        sides = _over_seabed(grid, body.known_sides()) if final else []
+        shape = _shape_of(grid, sides, final=final)
+        result.grid, result.mesh, result.dimensions = grid, shape.mesh, shape.dimensions
+        if not final:
+            return
+        if body.other is not None and body.other.stamps:
+            result.other_grid = body.other.grid()
+        result.sides = sides
+        result.looks = {look.info.stamp_ns: look for look in _over_seabed(grid, body.looks.values())}
+        heights = {}
+        if shape.dimensions is not None:
+            heights = {side.info.stamp_ns: shadow_height(side, shape.dimensions) for side in sides}
+        for stamp, info in sorted(body.infos.items()):
+            level, contrast, estimated = body.levels.get(stamp, (math.nan, math.nan, False))
+            x, y, z = map(float, info.camera.sonar_m)
+            result.evidence[stamp] = ViewEvidence(
+                stamp, info.aspect_rad, (x, y, z), level, contrast, estimated, heights.get(stamp, math.nan)
+            )
+
+    @staticmethod
+    def _open_hollows(result: Result) -> None:
+        """Tell the matter in a result's grid from hollows that no shadow shows; the grid stays as it is."""
+        if result.grid is None:
+            return
+        result.matter = matter_of(result.grid, result.looks.values())
+        hollow = bool((result.grid.occupied & ~result.matter).any())
+        result.matter_mesh = matter_mesh(result.grid, result.matter) if hollow else result.mesh
+
+    @staticmethod
+    def _add_objects(result: Result, body: Body) -> None:
+        """Add what a further body turned out to be, without what was reported before it."""
+        place = body.target.position_m
+        if not body.carver.stamps:
+            result.left_out.append(LeftOut(place, f"no view of it was usable: {body.refused}"))
+            return
+        whole = body.carver.grid()
+        found, left_out = objects_of(whole, place, [o.grid for o in result.objects])
+        result.left_out += left_out
+        for grid in found:
+            # Silhouettes are those of the whole body: they measure a piece only where it is all of it.
+            alone = grid is whole
+            shape = _shape_of(grid, _over_seabed(grid, body.known_sides()) if alone else [], final=True)
+            target, box = body.target, grid.volume
+            if not alone:
+                target = Target((box.centre_m[0], box.centre_m[1]), box.size_m)
+            if shape.mesh is not None and shape.dimensions is not None:
+                views = len(body.carver.stamps)
+                result.further.append(ObjectResult(target, grid, shape.mesh, shape.dimensions, views))
+
+
+def _made(view: ProcessedView, parts: Collection[str]) -> ProcessedView:
+    """Make the parts of a view, in this thread."""
+    for part in parts:
+        getattr(view, part)
+    return view
+
+
+Kept = TypeVar("Kept", SilhouetteSides, EchoLook)
+
+
+def _over_seabed(grid: VoxelGrid, kept: Iterable[Kept]) -> list[Kept]:
+    """Give what was kept of views the sonar's height over the seabed that the grid was carved over."""
+    slope = grid.seabed
+    return [one if slope is None else replace(one, info=slope.corrected(one.info)) for one in kept]

@@ -1,0 +1,137 @@
+"""Which pieces of a carved volume are objects of their own.
+
+A body of the search need not become an object: it may be a phantom of crossing shadows, the part of another
+body that reaches into its volume, or nothing once it is looked at sharply. What is left out says why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from ..carving import part_around
+from ..search.decision import PHANTOM
+from ..target import stands_on_seabed
+from ..threshold import LEAST_VOXELS
+from ..volume import VoxelGrid
+from .result import LeftOut
+
+#: Two carved objects are the same body where they share this much of the smaller one.
+_SAME_BODY = 0.25
+#: Voxels round one of several pieces that were carved in one volume.
+_MARGIN_VOXELS = 3
+
+
+def connected_pieces(occupied: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """Return the pieces of a carved grid that do not touch one another, the largest first.
+
+    Parameters
+    ----------
+    occupied : ndarray of bool, shape (nz, ny, nx)
+        Voxels that meet at a corner are connected.
+
+    Returns
+    -------
+    list of ndarray of bool, each of that shape
+    """
+    labels, count = scipy.ndimage.label(occupied, np.ones((3, 3, 3), bool))
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
+    return [np.asarray(labels == 1 + i) for i in np.argsort(-sizes, kind="stable")]
+
+
+def overlap_share(a: VoxelGrid, b: VoxelGrid) -> float:
+    """Return how much two grids' objects share, as a fraction of the smaller one (by volume).
+
+    The lattices may differ: a voxel of `a` is shared where its centre lies in an occupied voxel of `b`.
+    """
+    if not a.occupied.any() or not b.occupied.any():
+        return 0.0
+    k, j, i = np.nonzero(a.occupied)
+    index = []
+    for where, axis, origin, size in zip(
+        (k, j, i),
+        (a.volume.z_m, a.volume.y_m, a.volume.x_m),
+        b.volume.origin_m[::-1],
+        b.occupied.shape,
+        strict=True,
+    ):
+        at = np.rint((axis[where] - origin) / b.volume.voxel_size_m).astype(np.intp)
+        index.append(np.where((at >= 0) & (at < size), at, -1))
+    inside = np.all([at >= 0 for at in index], axis=0)
+    shared = np.count_nonzero(b.occupied[tuple(at[inside] for at in index)])
+    d_a, d_b = a.volume.voxel_size_m**3, b.volume.voxel_size_m**3
+    smaller = min(len(k) * d_a, np.count_nonzero(b.occupied) * d_b)
+    return float(shared * d_a / smaller)
+
+
+def objects_of(
+    grid: VoxelGrid, place_m: tuple[float, float], reported: Sequence[VoxelGrid]
+) -> tuple[list[VoxelGrid], list[LeftOut]]:
+    """Tell the objects in a body's carved volume, without what was reported before.
+
+    Parameters
+    ----------
+    grid : VoxelGrid
+        Carved round the body.
+    place_m : (float, float)
+        Where the search found it.
+    reported : sequence of VoxelGrid
+        Grids of the objects found so far, in that order.
+
+    Returns
+    -------
+    objects : list of VoxelGrid
+        None to many, the largest first: `grid` itself where it holds one, cut down to each piece otherwise.
+    left_out : list of LeftOut
+        Pieces, or the whole body, that are no objects.
+    """
+    pieces = connected_pieces(grid.occupied)
+    if not pieces:
+        return [], [LeftOut(place_m, "no voxel of its volume lies in shadow from all sides")]
+    objects: list[VoxelGrid] = []
+    left_out = []
+    for piece in pieces:
+        one = _only(grid, piece, whole=len(pieces) == 1)
+        if reason := _why_no_object(grid, piece, [*reported, *objects]):
+            left_out.append(LeftOut(_middle(one), reason))
+        else:
+            objects.append(one)
+    return objects, left_out
+
+
+def _why_no_object(grid: VoxelGrid, piece: NDArray[np.bool_], reported: Sequence[VoxelGrid]) -> str:
+    """Return why a piece is no object of its own; empty if it is one."""
+    if int(np.count_nonzero(piece)) < LEAST_VOXELS:
+        return f"fewer than {LEAST_VOXELS} voxels are left of it"
+    alone = VoxelGrid(grid.volume, grid.likelihood, grid.views, grid.threshold, piece, grid.method)
+    for number, other in enumerate(reported, start=1):
+        share = overlap_share(alone, other)
+        if share >= _SAME_BODY:
+            return f"the same body as object {number}: they share {100.0 * share:.0f} % of the smaller one"
+    layers = np.flatnonzero(piece.any(axis=(1, 2)))
+    half = grid.volume.voxel_size_m / 2.0
+    bottom, top = grid.volume.z_m[layers[0]] - half, grid.volume.z_m[layers[-1]] + half
+    if not stands_on_seabed(float(bottom), float(top)):
+        return PHANTOM
+    plan = np.asarray(piece.any(axis=0))
+    if plan[0].any() or plan[-1].any() or plan[:, 0].any() or plan[:, -1].any():
+        return "it reaches through the side of its volume: a part of something else"
+    return ""
+
+
+def _only(grid: VoxelGrid, piece: NDArray[np.bool_], *, whole: bool) -> VoxelGrid:
+    """Return a grid in which a piece alone is occupied; cut down to the piece unless it is the whole body."""
+    if whole:
+        return grid
+    box, volume = part_around(piece, grid.volume, _MARGIN_VOXELS)
+    return VoxelGrid(
+        volume, grid.likelihood[box], grid.views[box], grid.threshold, piece[box].copy(), grid.method
+    )
+
+
+def _middle(grid: VoxelGrid) -> tuple[float, float]:
+    _, j, i = np.nonzero(grid.occupied)
+    return float(grid.volume.x_m[i].mean()), float(grid.volume.y_m[j].mean())

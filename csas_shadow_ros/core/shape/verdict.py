@@ -1,0 +1,82 @@
+"""What a result says, and how far it can be trusted, with the reasons."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..volume import VoxelGrid
+from .result import Quality, Result
+
+#: A result of less of the circle is limited: what is not seen from the other side is bounded by the volume
+#: alone (share of the circle). At half of it sides are missing without a word; at double none would be good.
+_WHOLE_ARC = 0.75
+#: So many of the views (share) may be refused before the result counts as limited. Consensus carving removes
+#: a voxel that 3 % of its views contradict, so losing a tenth of them hardly moves an edge; a gap in the
+#: circle is told by the arc as well.
+_MOST_REJECTED = 0.1
+
+
+def judge(result: Result) -> None:
+    """Set a result's verdict and quality.
+
+    Parameters
+    ----------
+    result : Result
+        Everything else of it is there.
+    """
+    reasons: list[str] = []
+    worst = 0
+    refused = len(result.rejected)
+    first = next(iter(result.rejected.values()), "")
+    if result.objects:
+        result.verdict = "object"
+    elif result.target is not None and not result.views_used:
+        result.verdict = "undecided"
+        reasons.append(f"no view of the target was usable{': ' if first else ''}{first}")
+        worst = 2
+    elif result.composites is None and refused:
+        result.verdict = "undecided"
+        reasons.append(f"none of {refused} views could be made: {first}")
+        worst = 2
+    else:
+        result.verdict = "no object"
+    if result.mesh is not None and result.grid is not None:
+        for side in cut_sides(result.grid):
+            reasons.append(f"the carved volume cuts the object at its {side}")
+            worst = 2
+    if result.views_used:
+        arc = math.degrees(result.arc_rad)
+        if arc < 360.0 * _WHOLE_ARC:
+            reasons.append(f"the views cover {arc:.0f}° of the circle")
+            worst = max(worst, 1)
+        if refused > _MOST_REJECTED * (refused + result.views_used):
+            reasons.append(f"{refused} of {refused + result.views_used} views were not used: {first}")
+            worst = max(worst, 1)
+        if result.final and result.dimensions is not None and not result.dimensions.intervals:
+            reasons.append("too few sides of shadows were seen for intervals")
+            worst = max(worst, 1)
+    result.quality = Quality(("good", "limited", "not trustworthy")[worst], tuple(reasons))
+
+
+def cut_sides(grid: VoxelGrid) -> list[str]:
+    """Return the sides of a carved volume that its object reaches through: what lies beyond is not known."""
+    body = grid.occupied
+    ends = {
+        "west side": body[:, :, 0],
+        "east side": body[:, :, -1],
+        "south side": body[:, 0],
+        "north side": body[:, -1],
+        "top": body[-1],
+    }
+    return [name for name, end in ends.items() if np.any(end)]
+
+
+def no_object_reason(result: Result) -> str:
+    """Say why there is no object."""
+    if result.target is None:
+        return "nothing casts a shadow of its own from all sides"
+    if not result.views_used:
+        return "no view of the target was usable"
+    return "no voxel of the carved volume lies in shadow from all sides"
