@@ -405,7 +405,7 @@ def _add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _run_options(p: argparse.ArgumentParser) -> None:
-    from .core.objects import MAX_OBJECTS, MOST_OBJECTS
+    from .core.parameters import MAX_OBJECTS, MOST_OBJECTS
     from .process import START_FROM
 
     p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")

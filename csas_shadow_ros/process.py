@@ -19,11 +19,11 @@ from .bags import BagReader, Problem, Run, read_run
 from .bags.check import ERROR, judge_amplitude, judge_coverage, judge_image, judge_sectors
 from .core.arcs import Arc, Arcs
 from .core.errors import BagError, CsasError, ParameterError, SpectrumSignError
-from .core.geometry import CoherentImage, Track, View
-from .core.objects import MAX_OBJECTS
-from .core.parameters import PipelineParameters
+from .core.geometry import CoherentImage, Track, View, looks_at
+from .core.parameters import MAX_OBJECTS, PipelineParameters
 from .core.pipeline import Result
 from .core.pipeline import run as run_pipeline
+from .core.search.decision import Decision, decide_by_views
 from .core.stages import STAGES, run_views, with_spectrum_sign
 from .results import Context, ResultsWriter, read_truth
 
@@ -76,8 +76,8 @@ def process_bag(
     workers : int
         Threads.
     max_objects : int
-        At most so many bodies are carved, the target among them (see `pipeline.run`). Starting from views,
-        which were made for one target, it is the only one.
+        At most so many bodies are carved, the target among them (see `pipeline.run`). Shadow views and what
+        follows them were made for one target.
     command : sequence of str
         Command line, for the report.
     progress : callable, optional
@@ -106,7 +106,7 @@ def process_bag(
         if stage == "image":
             result = _from_image(run, context, writer, workers, max_objects, progress, notice)
         else:
-            result = _from_views(run, context, writer, workers, progress, notice)
+            result = _from_views(run, context, writer, workers, max_objects, progress, notice)
         context.timings_s["write_views"] = writer.view_seconds
         result.timings_s["views"] = max(result.timings_s.get("views", 0.0) - writer.view_seconds, 0.0)
         context.problems = told_once(run.problems)
@@ -123,6 +123,7 @@ def replay_bag(
     *,
     start_from: str = "auto",
     rate: float = 0.0,
+    max_objects: int = MAX_OBJECTS,
     overwrite: bool = False,
     write_bag: bool = True,
     figures: bool = True,
@@ -134,7 +135,7 @@ def replay_bag(
 
     Parameters
     ----------
-    bag, out, parameters, start_from, overwrite, write_bag, figures, command, progress, notice
+    bag, out, parameters, start_from, max_objects, overwrite, write_bag, figures, command, progress, notice
         See `process_bag`.
     rate : float
         Views: times the recorded speed; 0: as fast as the nodes take them.
@@ -182,7 +183,8 @@ def replay_bag(
             stage=stage,
             rate=rate,
             record=True,
-            overrides={"bag_recorder": {"compress": False}},
+            max_objects=max_objects,
+            overrides={"bag_recorder": {"compression": "lz4"}},
             progress=progress or False,
             notice=notice,
         )
@@ -192,7 +194,7 @@ def replay_bag(
         context.track = run.track
         context.nodes, context.views_lost = node_table(replayed), replayed.lost
         context.views_in = replayed.views_total
-        result = adopt_replay(writer, replayed, p)
+        result = adopt_replay(writer, replayed, p, whole=rate == 0.0)
         (scratch / "log").rename(writer.work / "log")
         shutil.rmtree(scratch)
         context.problems = [*told_once(run.problems), *unplaced(replayed)]
@@ -278,7 +280,13 @@ def _from_image(
 
 
 def _from_views(
-    run: Run, context: Context, writer: ResultsWriter, workers: int, progress: Progress | None, notice: Notice
+    run: Run,
+    context: Context,
+    writer: ResultsWriter,
+    workers: int,
+    max_objects: int,
+    progress: Progress | None,
+    notice: Notice,
 ) -> Result:
     stage, sign = context.stage, context.spectrum_sign_override
     context.track = run.track
@@ -301,15 +309,57 @@ def _from_views(
         if not usable:
             raise BagError(run.why(f"none of the {run.counts[stage]} {stage} views is usable"))
 
+    decision = decision_of_views(run, stage, context.parameters, max_objects, views)
     return run_views(
         views,
         stage,
         context.parameters,
+        decision=decision,
+        sub_apertures=(lambda: run.views("sub_aperture")) if run.counts.get("sub_aperture") else None,
+        run_ns=run.run_ns,
         total=run.counts[stage],
         progress=progress,
         on_view=writer.add_view,
         workers=workers,
     )
+
+
+def decision_of_views(
+    run: Run,
+    stage: str,
+    parameters: PipelineParameters,
+    max_objects: int,
+    views: Callable[[], Iterator[View]] | None = None,
+) -> Decision:
+    """Say what is carved of a bag's views: what they were made for, where the bag tells, or what they show.
+
+    Parameters
+    ----------
+    run : Run
+        The bag.
+    stage : str
+        What its views are.
+    parameters : PipelineParameters
+        A target that is given there comes first.
+    max_objects : int
+        At most so many bodies are carved.
+    views : callable, optional
+        Gives the views, if not as they are in the bag.
+
+    Raises
+    ------
+    CsasError
+        See `core.search.decision.decide_by_views`.
+    """
+    each = views or (lambda: run.views(stage))
+    recorded = run.decision() if parameters.target.target == "auto" else None
+    if recorded is not None and recorded.target is not None:
+        first = next(iter(each()), None)
+        if first is not None and looks_at(first.info, recorded.target.position_m):
+            if stage != "sub_aperture" and not run.counts.get("sub_aperture"):
+                return replace(recorded, others=())
+            return recorded
+    return decide_by_views(each, stage, parameters.target, max_objects)
 
 
 def refuse_contradictions(image: CoherentImage, track: Track, notice: Notice = _ignore) -> None:

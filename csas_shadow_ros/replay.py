@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from .core import errors
 from .core.errors import CsasError, NoTargetError, ParameterError
-from .core.parameters import PipelineParameters
+from .core.parameters import MAX_OBJECTS, PipelineParameters
 from .graph import (
     MAX_DOMAIN_ID,
     Graph,
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
     from .core.geometry import GroundGrid
     from .core.mesh import Dimensions
+    from .core.search.decision import Decision
+    from .core.shape.result import Result
     from .core.volume import Target, VoxelGrid
 
 #: Stages of a bag, and the nodes that turn each into the next.
@@ -48,6 +50,8 @@ _CHAIN = {
     "shadow_mask": ("voxel_carver",),
 }
 _WITH_COMPOSITES = ("image", "sector", "sub_aperture")
+#: What is published already comes within a second, on a busy machine in some.
+_COLLECT_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -99,18 +103,16 @@ class ReplayResult:
     ----------
     stage : str
         What the bag was played from.
-    target : Target or None
-        The volume that was carved; None: there is no object.
-    grid : VoxelGrid or None
-        The carved grid.
-    mesh, dimensions : trimesh.Trimesh, Dimensions or None
-        Surface and measures of the object.
+    result : Result
+        What the graph published: grid, mesh, dimensions, objects, verdict, … as of `pipeline.run`.
     composites : dict
         ``multilook`` (float32) and ``color_by_aspect`` (uint8, RGB), where they were made.
     composites_grid : GroundGrid or None
         Their lattice.
-    views_total, views_used : int
-        Views that the source had, and views in the grid.
+    composed : int
+        Views in them.
+    views_total : int
+        Views that the source had.
     rejected : list of RejectedView
         Views that were not used.
     lost : int
@@ -121,22 +123,47 @@ class ReplayResult:
         The bag that was recorded.
     seconds : float
         Wall time, from the first process to the result.
+    seconds_after : float
+        Of that, since the last view was through.
     """
 
     stage: str
-    target: Target | None = None
-    grid: VoxelGrid | None = None
-    mesh: trimesh.Trimesh | None = None
-    dimensions: Dimensions | None = None
+    result: Result
     composites: dict[str, NDArray[Any]] = field(default_factory=dict)
     composites_grid: GroundGrid | None = None
+    composed: int = 0
     views_total: int = 0
-    views_used: int = 0
     rejected: list[RejectedView] = field(default_factory=list)
     lost: int = 0
     nodes: dict[str, NodeReport] = field(default_factory=dict)
     recording: Path | None = None
     seconds: float = 0.0
+    seconds_after: float = 0.0
+
+    @property
+    def target(self) -> Target | None:
+        """The volume that was carved; None: there is no object."""
+        return self.result.target
+
+    @property
+    def grid(self) -> VoxelGrid | None:
+        """The carved grid."""
+        return self.result.grid
+
+    @property
+    def mesh(self) -> trimesh.Trimesh | None:
+        """Surface of the object."""
+        return self.result.mesh
+
+    @property
+    def dimensions(self) -> Dimensions | None:
+        """Measures of the object."""
+        return self.result.dimensions
+
+    @property
+    def views_used(self) -> int:
+        """Views in the grid."""
+        return self.result.views_used
 
 
 class _Watcher:
@@ -175,15 +202,16 @@ class _Watcher:
         self.rejected: dict[tuple[int, str], RejectedView] = {}
         self.errors: dict[str, str] = {}
         self.latest: dict[str, Any] = {}
+        self._collected: set[str] = set()
         self._subscriptions: list[Any] = []
         self._subscribe("progress", qos.REPORTS, self._on_progress, raw=True)
 
     def _subscribe(
         self, topic: str, profile: Any, callback: Callable[[Any], None], *, raw: bool = False
     ) -> None:
-        from msg_adapters import TOPICS
+        from msg_adapters import topic as topic_of
 
-        kind = self._messages.cls(TOPICS[topic].type_name)
+        kind = self._messages.cls(topic_of(topic).type_name)
         self._subscriptions.append(self._node.create_subscription(kind, topic, callback, profile, raw=raw))
 
     def _on_progress(self, cdr: bytes) -> None:
@@ -240,14 +268,12 @@ class _Watcher:
                         subscription.callback(taken[0])
         time.sleep(seconds)
 
-    def collect(self, topics: tuple[str, ...], timeout_s: float) -> dict[str, Any]:
-        """Return the last message of latched topics: whoever subscribes now gets the final ones."""
+    def collect(self, topics: Iterable[str]) -> None:
+        """Take latched topics from now on: whoever subscribes gets the last message of each."""
         for topic in topics:
-            self._subscribe(topic, self._qos.LATCHED, partial(self.latest.__setitem__, topic))
-        end = time.monotonic() + timeout_s
-        while not set(topics) <= set(self.latest) and time.monotonic() < end:
-            self.spin(0.01)
-        return self.latest
+            if topic not in self._collected:
+                self._collected.add(topic)
+                self._subscribe(topic, self._qos.LATCHED, partial(self.latest.__setitem__, topic))
 
     def close(self) -> None:
         self._node.destroy_node()
@@ -255,7 +281,7 @@ class _Watcher:
 
 
 def node_parameters(
-    parameters: PipelineParameters, target: Target | None = None
+    parameters: PipelineParameters, target: Target | None = None, max_objects: int = MAX_OBJECTS
 ) -> dict[str, dict[str, Any]]:
     """Spread the pipeline's parameters over the nodes.
 
@@ -265,6 +291,8 @@ def node_parameters(
         Parameters of all stages.
     target : Target, optional
         Given to every node behind `sub_aperture`, for bags that hold no image to find it in.
+    max_objects : int
+        Bodies that are carved at most.
     """
 
     def of(*sets: Any) -> dict[str, Any]:
@@ -276,10 +304,10 @@ def node_parameters(
         place = {"target": "given", "position_m": tuple(target.position_m)}
     box = {**place, "size_m": tuple(target.size_m)} if target is not None else {}
     return {
-        "sub_aperture": of(p.sub_aperture, p.target),
+        "sub_aperture": of(p.sub_aperture, p.target) | {"max_objects": max_objects},
         "shadow_enhancement": of(p.shadow) | place,
         "shadow_likelihood": of(p.likelihood) | box,
-        "voxel_carver": of(p.carving) | box,
+        "voxel_carver": of(p.shadow, p.likelihood, p.carving) | box,
     }
 
 
@@ -294,6 +322,7 @@ def replay(
     composites: bool = True,
     window: int = 4,
     domain_id: int | None = None,
+    max_objects: int = MAX_OBJECTS,
     overrides: Mapping[str, Mapping[str, Any]] | None = None,
     progress: Callable[[int, int], None] | bool = True,
     notice: Callable[[str], None] | None = None,
@@ -323,6 +352,8 @@ def replay(
         Views that may be on their way at once.
     domain_id : int, optional
         ROS domain, to look on with other tools; a free one otherwise.
+    max_objects : int
+        Bodies that are carved at most, the target among them; of shadow views and later stages one.
     overrides : mapping of node name to mapping, optional
         Further node parameters.
     progress : callable or bool
@@ -357,8 +388,9 @@ def replay(
                     f"out_dir is {str(out)!r} ({error.strerror}); expected a folder that can be written to"
                 ) from None
         recording = None if record is False else out / "recording" if record is True else Path(record)
-        chosen, target = _plan(bag, stage, p)
-        plan = _node_plan(bag, chosen, p, target, rate, recording, composites, window, overrides or {})
+        chosen, decision = _plan(bag, stage, p)
+        of_stage = node_parameters(p, None if decision is None else decision.target, max_objects)
+        plan = _node_plan(bag, chosen, of_stage, rate, recording, composites, window, overrides or {})
         check(plan)
         domain = free_domain_id() if domain_id is None else domain_id
         server = stack.enter_context(start_fork_server(domain, out / "log"))
@@ -368,51 +400,55 @@ def replay(
             stack.callback(watcher.close)
         done = stack.enter_context(_shown(progress))
         _until_complete(graph, watcher, chosen, done, tell, stall_timeout_s)
-        result = _collect(watcher, graph, chosen, p, target)
+        through = time.monotonic()
+        messages = _collect(graph, watcher, chosen, done, tell, stall_timeout_s)
+        result = _result_of(messages, watcher, graph, chosen)
+        result.seconds_after = time.monotonic() - through
         result.recording = recording
         result.seconds = time.monotonic() - began
     return result
 
 
-def _plan(bag: str | Path, stage: str, p: PipelineParameters) -> tuple[str, Target | None]:
-    """Say what is played, and where the target is if no node can find it."""
+def _plan(bag: str | Path, stage: str, p: PipelineParameters) -> tuple[str, Decision | None]:
+    """Say what is played, and what is carved if no node can decide it."""
     from .bags import BagReader, read_run
     from .nodes.playing import stage_of_bag
 
-    reader = BagReader(bag)
-    chosen = stage_of_bag(reader, stage)
+    chosen = stage_of_bag(BagReader(bag), stage)
     if chosen in ("image", "sector"):
         return chosen, None
-    hard = p.carving.takes_masks
-    if chosen in ("likelihood", "shadow_mask") and (chosen == "shadow_mask") != hard:
-        expected = "hard" if chosen == "shadow_mask" else "one that takes likelihoods (soft)"
-        raise ParameterError(f"method is {p.carving.method!r}; expected {expected} for {chosen} views")
-    from .core.stages import target_of_views
+    from .core.stages import check_method
+    from .process import decision_of_views
 
-    run = read_run(bag)
-    target = target_of_views(lambda: run.views(chosen), chosen, p.target)
-    if target is None:
+    check_method(chosen, p)
+    decision = decision_of_views(read_run(bag), chosen, p, 1)
+    if decision.target is None:
         raise NoTargetError(f"there is no object in the {chosen} views of {bag}")
-    return chosen, target
+    return chosen, decision
 
 
 def _node_plan(
     bag: str | Path,
     stage: str,
-    p: PipelineParameters,
-    target: Target | None,
+    of_stage: Mapping[str, dict[str, Any]],
     rate: float,
     recording: Path | None,
     composites: bool,
     window: int,
     overrides: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, dict[str, Any]]:
-    of_stage = node_parameters(p, target)
     plan: dict[str, dict[str, Any]] = {name: of_stage[name] for name in _CHAIN[stage]}
     if composites and stage in _WITH_COMPOSITES:
         plan["composites"] = {}
+    # Figure 8 compares the methods.
+    plan["voxel_carver"] |= {"compare": stage not in ("likelihood", "shadow_mask")}
     if recording is not None:
         plan["bag_recorder"] = {"out": str(recording.resolve())}
+    if rate == 0.0:
+        # Flat out nobody looks at results that grow.
+        for name in ("voxel_carver", "composites"):
+            if name in plan:
+                plan[name]["publish_hz"] = 0.0
     # The source waits for its sinks, or the first views are made twice.
     sinks = 1 + ("composites" in plan)
     flow: dict[str, Any] = {"window": window, "min_sinks": sinks}
@@ -457,6 +493,7 @@ def _until_complete(
     progress: Callable[[int, int], None],
     tell: Callable[[str], None],
     stall_timeout_s: float,
+    told: int = 0,
 ) -> None:
     # What the result takes is loaded while the nodes are, one after the other: later they need every core.
     import trimesh  # noqa: F401
@@ -465,7 +502,7 @@ def _until_complete(
 
     source = "sub_aperture" if stage in ("image", "sector") else stage
     sender = "sub_aperture" if stage in ("image", "sector") else "bag_player"
-    told, finished = 0, False
+    finished = False
     state: object = None
     since = time.monotonic()
     while True:
@@ -520,48 +557,61 @@ def _error_of(node: str, text: str) -> CsasError:
 
 
 def _collect(
-    watcher: _Watcher, graph: Graph, stage: str, p: PipelineParameters, target: Target | None
-) -> ReplayResult:
-    import numpy as np
+    graph: Graph,
+    watcher: _Watcher,
+    stage: str,
+    progress: Callable[[int, int], None],
+    tell: Callable[[str], None],
+    stall_timeout_s: float,
+) -> dict[str, Any]:
+    """Take what the graph has published; a node that dies before is started again and publishes it again."""
+    from msg_adapters.result import topics_of_result
 
-    from msg_adapters import ground_picture_from_msgs, mesh_from_msg, target_from_msg, voxel_grid_from_msgs
+    wanted = {"measurements", "objects"}
+    if stage in ("image", "sector"):
+        wanted |= {"search", "target"}
+    if "composites" in graph.processes and _views_in(watcher, "composites"):
+        wanted |= {f"{s}/{t}" for s in ("multilook", "color_by_aspect") for t in ("image", "camera_info")}
+    dead = len(graph.deaths)
+    since = time.monotonic()
+    while True:
+        watcher.collect(wanted)
+        got = watcher.latest
+        if wanted <= set(got):
+            further = set(topics_of_result(got["measurements"]))
+            if further <= set(got):
+                return got
+            wanted |= further
+            continue
+        watcher.spin(0.01)
+        graph.watch()
+        if len(graph.deaths) > dead:
+            # What died takes what it had published with it: its successor works until it can say it again.
+            _until_complete(graph, watcher, stage, progress, tell, stall_timeout_s, told=dead)
+            dead, since = len(graph.deaths), time.monotonic()
+        elif time.monotonic() - since > _COLLECT_S:
+            missing = ", ".join(sorted(wanted - set(got)))
+            raise ReplayError(f"the result did not come on {missing} in {_COLLECT_S:g} s")
 
-    from .core.mesh import measure
-    from .core.threshold import thresholded
-    from .core.volume import Target
 
-    result = ReplayResult(stage, target=target)
+def _views_in(watcher: _Watcher, node: str) -> int:
+    told = [b.counts.get("views", 0) for (name, _), b in watcher.beats.items() if name == node]
+    return max(told, default=0)
+
+
+def _result_of(got: Mapping[str, Any], watcher: _Watcher, graph: Graph, stage: str) -> ReplayResult:
+    """Put together what the graph has published."""
+    from msg_adapters import ground_picture_from_msgs, result_from_msgs
+
+    result = ReplayResult(stage, result_from_msgs(got))
+    result.composed = _views_in(watcher, "composites")
     for (node, stream), beat in sorted(watcher.beats.items()):
         if node in graph.processes:
             restarts = graph.processes[node].restarts
             result.nodes[node] = NodeReport(beat.counts.get("busy_ms", 0) / 1e3, restarts, dict(beat.counts))
         if "total" in beat.counts and stream != "sector":
             result.views_total, result.lost = beat.counts["total"], beat.counts["lost"]
-        if node == "voxel_carver":
-            result.views_used = beat.counts.get("views", 0)
     result.rejected = sorted(watcher.rejected.values(), key=lambda r: (r.stamp_ns, r.aspect_deg))
-    topics: list[str] = []
-    if stage in ("image", "sector"):
-        topics.append("target")
-    if result.views_used:
-        topics += [f"{s}/{t}" for s in ("voxel_grid", "voxel_views") for t in ("image", "camera_info")]
-        topics += ["voxels", "mesh"]
-    if result.nodes.get("composites") and result.nodes["composites"].counts.get("views"):
-        topics += [f"{s}/{t}" for s in ("multilook", "color_by_aspect") for t in ("image", "camera_info")]
-    got = watcher.collect(tuple(topics), 20.0)
-    if missing := [t for t in topics if t not in got]:
-        raise ReplayError(f"the result did not come on {', '.join(missing)} in 20 s")
-    if "target" in got:
-        box = target_from_msg(got["target"])
-        result.target = None if box is None else Target((box.centre_m[0], box.centre_m[1]), box.size_m)
-    if result.views_used:
-        _, volume, likelihood = voxel_grid_from_msgs(got["voxel_grid/image"], got["voxel_grid/camera_info"])
-        _, _, views = voxel_grid_from_msgs(
-            got["voxel_views/image"], got["voxel_views/camera_info"], "voxel_views"
-        )
-        result.grid = thresholded(volume, likelihood, views.astype(np.uint16), p.carving)
-        result.mesh = mesh_from_msg(got["mesh"])
-        result.dimensions = measure(result.mesh) if result.mesh is not None else None
     for name in ("multilook", "color_by_aspect"):
         if f"{name}/image" in got:
             ground, pixels = ground_picture_from_msgs(got[f"{name}/image"], got[f"{name}/camera_info"], name)

@@ -20,6 +20,13 @@ from .camera_info import (
     view_info_to_msg,
 )
 from .image import check_pixels, image_from_msg, image_to_msg, pixels_from_msg, quantise
+from .measurements import (
+    Measurements,
+    evidence_from_msg,
+    evidence_to_msg,
+    measurements_from_msg,
+    measurements_to_msg,
+)
 from .mesh import mesh_from_msg, mesh_to_msg
 from .messages import (
     SCENE_FRAME,
@@ -31,6 +38,7 @@ from .messages import (
     stamp_to_ns,
     type_name_of,
 )
+from .objects import objects_from_msg, objects_to_msg
 from .pairs import (
     Pairer,
     coherent_image_from_msgs,
@@ -53,9 +61,11 @@ from .progress import (
     progress_from_msg,
     progress_to_msg,
 )
+from .result import result_from_msgs, result_to_msgs, topics_of_result
+from .search import SearchMessage, decision_from_msg, decision_to_msg
 from .target import TargetBox, target_from_msg, target_may_move, target_to_msg
-from .topics import NAMESPACE, STREAMS, TOPICS, VIEW_STREAMS, ImageStream, Topic, absolute_name
-from .track import track_from_msg, track_to_msg
+from .topics import NAMESPACE, STREAMS, TOPICS, VIEW_STREAMS, ImageStream, Topic, absolute_name, topic
+from .track import track_from_msg, track_piece_from_msg, track_to_msg
 from .voxels import Voxels, voxels_from_msg, voxels_to_msg
 
 __all__ = [
@@ -69,10 +79,12 @@ __all__ = [
     "Heartbeat",
     "ImageStream",
     "Level",
+    "Measurements",
     "MessageFactory",
     "Pairer",
     "RclpyMessages",
     "RosbagsMessages",
+    "SearchMessage",
     "SectorInfo",
     "TargetBox",
     "Topic",
@@ -83,7 +95,11 @@ __all__ = [
     "check_pixels",
     "coherent_image_from_msgs",
     "coherent_image_to_msgs",
+    "decision_from_msg",
+    "decision_to_msg",
     "diagnostics_to_msg",
+    "evidence_from_msg",
+    "evidence_to_msg",
     "ground_info_from_msg",
     "ground_info_to_msg",
     "ground_picture_from_msgs",
@@ -91,13 +107,19 @@ __all__ = [
     "image_from_msg",
     "image_to_msg",
     "is_routine_report",
+    "measurements_from_msg",
+    "measurements_to_msg",
     "mesh_from_msg",
     "mesh_to_msg",
     "message_from_cdr",
+    "objects_from_msg",
+    "objects_to_msg",
     "pixels_from_msg",
     "progress_from_msg",
     "progress_to_msg",
     "quantise",
+    "result_from_msgs",
+    "result_to_msgs",
     "sector_from_msgs",
     "sector_info_from_msg",
     "sector_info_to_msg",
@@ -107,7 +129,10 @@ __all__ = [
     "target_from_msg",
     "target_may_move",
     "target_to_msg",
+    "topic",
+    "topics_of_result",
     "track_from_msg",
+    "track_piece_from_msg",
     "track_to_msg",
     "type_name_of",
     "view_from_msgs",

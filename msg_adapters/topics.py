@@ -7,7 +7,8 @@ image), whose messages belong together by their stamps.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from csas_shadow_ros.core.errors import AdapterError
@@ -19,6 +20,7 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 PATH = "nav_msgs/msg/Path"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 MARKER = "visualization_msgs/msg/Marker"
+MARKERS = "visualization_msgs/msg/MarkerArray"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 #: Encodings of complex pixels; integers come out as complex64.
@@ -169,6 +171,13 @@ STREAMS: dict[str, ImageStream] = {
             "count",
             "how many views know something of each voxel, on the lattice of voxel_grid",
         ),
+        ImageStream(
+            "matter",
+            (VOXEL_ENCODING,),
+            CSAS_VOXEL_GRID,
+            "count",
+            "1 where the object holds matter, 0 elsewhere and in hollows, on the lattice of voxel_grid",
+        ),
     )
 }
 
@@ -193,6 +202,11 @@ def _topics() -> dict[str, Topic]:
         Topic("target", MARKER, "the carved volume as a CUBE; action DELETE: no object"),
         Topic("voxels", POINT_CLOUD, "voxels that may be object: x y z l_out views"),
         Topic("mesh", MARKER, "TRIANGLE_LIST of the thresholded surface; action DELETE: no object"),
+        Topic("matter/mesh", MARKER, "TRIANGLE_LIST of the surface without hollows; action DELETE: none"),
+        Topic("objects", MARKERS, "an oriented CUBE and a TEXT an object; action DELETE for what is gone"),
+        Topic("measurements", DIAGNOSTICS, "each object and the run: values, intervals, verdict"),
+        Topic("evidence", DIAGNOSTICS, "a status a view in the grid: levels, and the height it tells"),
+        Topic("search", DIAGNOSTICS, "what is carved: the target, further bodies, and what was left out"),
         Topic("progress", DIAGNOSTICS, "what became of each view, and the nodes' heartbeats"),
         Topic("/diagnostics", DIAGNOSTICS, "views in, out, rejected and why, rates"),
     ]
@@ -203,20 +217,89 @@ def _topics() -> dict[str, Topic]:
 TOPICS: dict[str, Topic] = _topics()
 
 
-def stream(name: str) -> ImageStream:
-    """Return the image stream of that name.
+#: Topics of a grid, which further objects and the other method have too, each under its prefix.
+GRID_TOPICS = (
+    *(f"{s}/{part}" for s in ("voxel_grid", "voxel_views") for part in ("camera_info", "image")),
+    "voxels",
+    "mesh",
+)
+#: Topics of a run's result, without those of further objects.
+RESULT_TOPICS = (
+    *GRID_TOPICS,
+    "matter/camera_info",
+    "matter/image",
+    "matter/mesh",
+    "objects",
+    "measurements",
+    "evidence",
+)
+#: Prefix of the grid by the other method.
+OTHER_METHOD = "other_method"
+_PREFIX = re.compile(rf"(object_(?:[2-9]|[1-5]\d|6[0-4])|{OTHER_METHOD})/(.+)")
+#: Topics whose last message holds until another one comes.
+_LATCHED = frozenset(
+    {"image", "camera_info", "track", "target", "search", *RESULT_TOPICS}
+    | {f"{s}/{part}" for s in ("multilook", "color_by_aspect") for part in ("camera_info", "image")}
+)
+
+
+def prefixed(prefix: str, name: str) -> str:
+    """Return the name of a grid's topic under a prefix (``object_2``), or as it is under none."""
+    return f"{prefix}/{name}" if prefix else name
+
+
+def split_prefix(name: str) -> tuple[str, str]:
+    """Split a topic, or stream, into its prefix (``object_2``, ``other_method`` or none) and the rest.
+
+    Examples
+    --------
+    >>> split_prefix("object_2/voxel_grid/image")
+    ('object_2', 'voxel_grid/image')
+    >>> split_prefix("voxels")
+    ('', 'voxels')
+    """
+    match = _PREFIX.fullmatch(name)
+    if match and any(t == match.group(2) or t.startswith(f"{match.group(2)}/") for t in GRID_TOPICS):
+        return match.group(1), match.group(2)
+    return "", name
+
+
+def topic(name: str) -> Topic:
+    """Return a topic of the contract by its relative name, with or without a prefix.
 
     Raises
     ------
     AdapterError
         If there is none.
     """
-    try:
-        return STREAMS[name]
-    except KeyError:
-        raise AdapterError(
-            f"there is no image stream {name!r}; expected one of: {', '.join(STREAMS)}"
-        ) from None
+    found = TOPICS.get(split_prefix(name)[1])
+    if found is None:
+        raise AdapterError(f"there is no topic {name!r}; expected one of: {', '.join(TOPICS)}")
+    return replace(found, name=name)
+
+
+def is_topic(name: str) -> bool:
+    """Say whether the contract has a topic of that relative name."""
+    return split_prefix(name)[1] in TOPICS
+
+
+def is_latched(name: str) -> bool:
+    """Say whether the last message of a topic holds until another one comes."""
+    return split_prefix(name)[1] in _LATCHED
+
+
+def stream(name: str) -> ImageStream:
+    """Return the image stream of that name, with or without a prefix.
+
+    Raises
+    ------
+    AdapterError
+        If there is none.
+    """
+    found = STREAMS.get(split_prefix(name)[1])
+    if found is None:
+        raise AdapterError(f"there is no image stream {name!r}; expected one of: {', '.join(STREAMS)}")
+    return found if found.name == name else replace(found, name=name)
 
 
 def absolute_name(name: str, namespace: str = NAMESPACE) -> str:
@@ -237,4 +320,7 @@ def topic_table() -> str:
         package, _, name = topic.type_name.split("/")
         kind = ", ".join(topic.encodings or topic.distortion_models)
         lines.append(f"| `{topic.name}` | {package}/{name} | {kind} | {topic.description} |")
+    grid = "`voxel_grid/*`, `voxel_views/*`, `voxels`, `mesh`"
+    lines.append(f"| `object_N/…` | as without prefix | | {grid} of objects 2, 3, … |")
+    lines.append(f"| `{OTHER_METHOD}/…` | as without prefix | | {grid} by the other method, if asked for |")
     return "\n".join(lines) + "\n"

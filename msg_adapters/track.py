@@ -69,3 +69,9 @@ def track_from_msg(msg: Any, max_gap_rad: float = DEFAULT_MAX_GAP_RAD) -> Track:
         return Track(stamps, positions, max_gap_rad=max_gap_rad)
     except CsasError as error:
         raise AdapterError(f"track.poses: {error}") from error
+
+
+def track_piece_from_msg(msg):
+    from csas_shadow_ros.core.geometry.runs import TrackPiece
+    t = track_from_msg(msg)
+    return TrackPiece(t.stamps_ns, t.positions_m, stamp_to_ns(msg.header.stamp))

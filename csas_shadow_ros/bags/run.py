@@ -36,6 +36,7 @@ from msg_adapters.track import track_from_msg, track_to_msg
 from .bag import BagMessage, BagReader, BagWriter
 
 if TYPE_CHECKING:
+    from csas_shadow_ros.core.search.decision import Decision
     from csas_shadow_ros.core.streaming import SectorSum
 
 T = TypeVar("T")
@@ -100,6 +101,7 @@ class Run:
     track: Track | None
     counts: dict[str, int]
     problems: list[Problem] = field(default_factory=list)
+    run_ns: int | None = None
     _reader: BagReader | None = None
     _sum: SectorSum | None = None
     _infos: list[SectorInfo] | None = None
@@ -193,6 +195,29 @@ class Run:
         rest = len(problems) - 1
         more = f" (and {rest} more problem{'s' if rest > 1 else ''})" if rest > 0 else ""
         return f"{self.path}: {lack}{found}{more}"
+
+    def decision(self) -> Decision | None:
+        """Return what the views of the bag were made for, as its topic `search` or `target` tells; None if neither."""
+        # Late: it needs the method, which readers of messages need not load.
+        from csas_shadow_ros.core.search.decision import Decision
+        from csas_shadow_ros.core.volume import Target
+        from msg_adapters.search import decision_from_msg
+        from msg_adapters.target import target_from_msg
+
+        if self._reader is None:
+            return None
+        found: Decision | None = None
+        for topic in ("target", "search"):
+            for message, decoded, stamp in checked_messages(self._reader, topic, self.report):
+                try:
+                    if topic == "search":
+                        found = decision_from_msg(decoded).decision
+                        continue
+                    box = target_from_msg(decoded)
+                    found = Decision(None if box is None else Target(box.centre_m[:2], box.size_m))
+                except CsasError as error:
+                    self.report(Problem(message.topic, message.number, stamp, str(error)))
+        return found
 
     def _each(self, stream_name: str, read: Callable[[Any, Any], T]) -> Iterator[T]:
         if self._reader is None:
@@ -339,7 +364,7 @@ def read_run(path: str | Path, namespace: str | None = None) -> Run:
     reader = BagReader(path, namespace)
     found = {name: reader.topic(s.image_topic) for name, s in STREAMS.items()}
     counts = {name: info.count for name, info in found.items() if info is not None and info.count}
-    run = Run(Path(path), reader.namespace, None, None, counts, [], reader)
+    run = Run(Path(path), reader.namespace, None, None, counts, [], None, reader)
     run.image = _one_image(run, reader)
     run.track = _longest_track(run, reader)
     for line in reader.problems:

@@ -100,6 +100,13 @@ class Parameters:
         return cls(**values)
 
 
+#: Bodies carved if nothing else is asked for, the target among them. Each further one takes about half
+#: of the target's time.
+MAX_OBJECTS = 4
+#: More than this are refused: their views would not fit into memory.
+MOST_OBJECTS = 64
+
+
 @dataclass(frozen=True)
 class SubApertureParameters(Parameters):
     """Sub-aperture generation (section 3.1)."""

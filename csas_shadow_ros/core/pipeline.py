@@ -11,15 +11,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import cached_property
+from typing import Any
 
-from .errors import check_range
+from .errors import ViewError, check_range
 from .geometry import CoherentImage, Track, View
 from .hollows import EchoLook
 from .likelihood import Levels, outside_likelihood, view_levels
 from .measurement import SilhouetteSides, silhouette_sides
-from .parameters import PipelineParameters
+from .parameters import MAX_OBJECTS, MOST_OBJECTS, PipelineParameters
 from .reconstruction import Reconstruction
-from .search.decision import MAX_OBJECTS, MOST_OBJECTS, Decision, decide_by_image
+from .search.decision import Decision, decide_by_image
 from .segmentation import segment_shadow
 from .shadow import enhance
 from .shape.result import Result
@@ -45,6 +46,13 @@ class ProcessedView:
         self.sub_aperture = given.pop("sub_aperture", None)
         # A stage that is given is never made.
         self.__dict__.update({stage.removeprefix("shadow_"): view for stage, view in given.items()})
+
+    def require(self, part: str) -> Any:
+        """Return a part, or raise a ViewError where what is there does not tell it."""
+        made = getattr(self, part)
+        if made is None:
+            raise ViewError(f"a view's {part} cannot be made: what comes before it is not there")
+        return made
 
     @cached_property
     def shadow(self) -> View | None:

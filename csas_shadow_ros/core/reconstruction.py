@@ -312,6 +312,15 @@ class Reconstruction:
                 if number == 0:
                     self.refuse(aspect_rad, str(error))
 
+    def add_others(self, views: Sequence[ProcessedView]) -> None:
+        """Take a view in for the bodies besides the target (the first), whose own comes another way."""
+        for number, view in enumerate(views[: len(self.bodies)]):
+            if number:
+                try:
+                    self.add(view, number, self.parts_of(number))
+                except ViewError as error:
+                    self.bodies[number].refused = self.bodies[number].refused or str(error)
+
     def compose(self, view: View | None) -> None:
         """Add a view to the images of the circle."""
         if view is None:

@@ -13,10 +13,10 @@ from dataclasses import replace
 
 from .errors import ParameterError, ViewError
 from .geometry import View
-from .parameters import PipelineParameters
+from .parameters import MAX_OBJECTS, PipelineParameters
 from .pipeline import ProcessedView, Result, process
 from .reconstruction import Reconstruction
-from .search.decision import MAX_OBJECTS, Decision, decide_by_views
+from .search.decision import Decision, decide_by_views
 
 #: Stages that a run can start from, first to last.
 STAGES = ("sub_aperture", "shadow", "likelihood", "shadow_mask")
@@ -28,6 +28,7 @@ def run_views(
     parameters: PipelineParameters | None = None,
     *,
     decision: Decision | None = None,
+    sub_apertures: Callable[[], Iterable[View]] | None = None,
     run_ns: int | None = None,
     total: int = 0,
     progress: Callable[[int, int], None] | None = None,
@@ -49,6 +50,9 @@ def run_views(
         Parameters of the stages that follow.
     decision : Decision, optional
         What is carved, where it is known already; decided on by the views otherwise.
+    sub_apertures : callable, optional
+        Gives the sub-aperture views of the same run, where the bag holds them besides: what further bodies
+        are made of.
     run_ns : int, optional
         The run's name, where it has one.
     total : int
@@ -89,6 +93,9 @@ def run_views(
         return process(view, stage, chosen, p)
 
     done = reconstruction.feed(views(), make, total, progress=progress, on_view=on_view, workers=workers)
+    if stage != "sub_aperture" and chosen.others and sub_apertures is not None:
+        for view in sub_apertures():
+            reconstruction.add_others(process(view, "sub_aperture", chosen, p))
     if not done:
         raise ViewError(f"there is no usable {stage} view; expected at least one")
     return reconstruction.result()

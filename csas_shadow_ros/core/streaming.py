@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from .arcs import TOLERANCE_RAD, Arc, Arcs
 from .errors import GeometryError, NoTargetError, ViewError
 from .geometry import TWO_PI, CoherentImage, Track
-from .parameters import PipelineParameters, SubApertureParameters, TargetParameters
-from .search.decision import MAX_OBJECTS, Decision, decide_by_image
+from .parameters import MAX_OBJECTS, PipelineParameters, SubApertureParameters, TargetParameters
+from .search.decision import Decision, decide_by_image
 from .sector import Sector, unlike
 from .subaperture import Spectrum, SubApertures
 from .volume import Target, VoxelGrid
@@ -124,6 +124,17 @@ class SectorSum:
         self.stamps: set[int] = set()
         #: The furthest that any sector reaches beyond its arc (rad).
         self.margin_rad = _EDGE_RAD
+
+    @classmethod
+    def of_image(cls, image: CoherentImage, workers: int = 2) -> SectorSum:
+        """Take a full-circle image as the one sector that covers the circle."""
+        total = cls(workers)
+        blank = np.broadcast_to(np.complex64(0), image.grid.shape)
+        whole = Sector(blank, image.grid, image.acoustics, image.stamp_ns, 0.0, TWO_PI)
+        total._first, total._spectrum = whole, Spectrum.of_image(image, workers)
+        total.stamps.add(image.stamp_ns)
+        total.arcs.add(Arc(0.0, TWO_PI))
+        return total
 
     @property
     def newest_ns(self) -> int:
@@ -303,6 +314,7 @@ class Stream:
     ) -> None:
         self.parameters = sub_aperture or SubApertureParameters()
         self.target_parameters = target or TargetParameters()
+        self._workers = workers
         self.sum = SectorSum(workers)
         self.track: Track | None = None
         self.sub_apertures: SubApertures | None = None
@@ -359,6 +371,23 @@ class Stream:
             self.counts["late"] += 1
             self._stale, self.final = True, False
         return True
+
+    def take_image(self, image: CoherentImage) -> None:
+        """Take the run as a whole: its full-circle image.
+
+        Raises
+        ------
+        ParameterError
+            If a pixel is not finite.
+        GeometryError
+            If there are sectors already.
+        """
+        if self.sum.stamps:
+            raise GeometryError(
+                f"image stamped {image.stamp_ns} ns came during a run of {len(self.sum.stamps)} sectors;"
+                " expected one or the other"
+            )
+        self.sum, self._all_here = SectorSum.of_image(image, self._workers), True
 
     def finish(self) -> None:
         """Say that no more sectors are to come; those that come nevertheless are late."""

@@ -6,31 +6,34 @@ import fcntl
 import sys
 import time
 import zlib
-from dataclasses import replace
+from collections import deque
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
 from csas_shadow_ros.bags import BagReader, BagWriter
 from csas_shadow_ros.core.errors import BagError, ParameterError
-from msg_adapters import STREAMS, TOPICS, Heartbeat
-from msg_adapters.topics import absolute_name
+from csas_shadow_ros.core.geometry.runs import TrackBook
+from msg_adapters import STREAMS, TOPICS, message_from_cdr, track_piece_from_msg
+from msg_adapters.topics import absolute_name, is_latched, is_topic, split_prefix
+from msg_adapters.topics import topic as topic_of
 
 from . import qos
 from .base import INTEGRATED, CsasNode, Inlet, run_node
-from .playing import header_stamp, recorded_streams, topics_to_record
+from .playing import message_stamp, recorded_streams, topics_to_record
 
-#: Latched when they were published, and so when they are played.
-_LATCHED = frozenset(
-    {"image", "camera_info", "track", "target", "voxels", "mesh"}
-    | {
-        topic
-        for stream in ("multilook", "color_by_aspect", "voxel_grid", "voxel_views")
-        for topic in (STREAMS[stream].image_topic, STREAMS[stream].info_topic)
-    }
-)
 #: Topics of messages that differ though they carry the same stamp.
 _NEVER_ALIKE = frozenset({"progress", "/diagnostics"})
+#: A run's result stays published until the next one has these to say; then its bag is finished.
+_ENDS_THE_RUN_BEFORE = frozenset({"measurements", "voxel_grid/image"})
+#: Bags of one recorder, at most.
+_MOST_RUNS = 10_000
 _FLUSH_S = 1.0
+
+
+def _bag_of_run(out: Path, number: int) -> Path:
+    """Return the bag of the second, third, … run."""
+    return out.with_name(f"{out.name}_{number}")
 
 
 class RecordingInlet(Inlet):
@@ -41,6 +44,8 @@ class RecordingInlet(Inlet):
         self.node = node
         self.stream = stream
         self.role = "sink"
+        self.optional = True
+        self.held = deque()
         self.instance = f"{node.instance}-{stream}"
         self.stamps: dict[bool, set[int]] = {False: set(), True: set()}
 
@@ -55,26 +60,32 @@ class RecordingInlet(Inlet):
         for stamp in sorted(self.stamps[False] & self.stamps[True]):
             self.report(stamp, INTEGRATED, **self._idle())
 
-    def _idle(self) -> dict[str, str]:
-        # Right after the start this also means: not discovered yet.
-        published = self.node.count_publishers(STREAMS[self.stream].image_topic)
-        return {} if published else {"idle": "true"}
-
     def give_up_lonely(self) -> None:
         """Nothing is kept that could be lonely."""
 
-    def beat(self, *, leaving: bool) -> Heartbeat:
-        """Make the heartbeat; a stream that nobody publishes is waited for by nobody."""
-        beat = super().beat(leaving=leaving)
-        return replace(beat, values={**beat.values, **self._idle()})
+
+@dataclass(eq=False)
+class RunBag:
+    """The bag of one run while it is written."""
+
+    path: Path
+    writer: BagWriter
+    #: Name of the run; None until a track or a message that a track covers tells it.
+    run_ns: int | None = None
+    #: What is in it: (topic, stamp, checksum where messages of a stamp may differ).
+    seen: set[tuple[str, int, int]] = field(default_factory=set)
 
 
 class BagRecorderNode(CsasNode):
-    """Records raw messages. A view counts as recorded once both its messages are written."""
+    """Records raw messages, a bag a run. A view counts as recorded once both its messages are written."""
 
     name = "bag_recorder"
-    writer: BagWriter | None = None
     _lock: TextIO | None = None
+    _bags: list[RunBag]
+
+    def __init__(self, **options: Any) -> None:
+        self._bags = []
+        super().__init__(**options)
 
     def setup(self) -> None:
         """Open the bag, take over what a killed recorder left, and subscribe."""
@@ -87,12 +98,19 @@ class BagRecorderNode(CsasNode):
             for inlet in [RecordingInlet(self, stream)]
             for topic, is_info in ((STREAMS[stream].image_topic, False), (STREAMS[stream].info_topic, True))
         }
-        self._seen: set[tuple[str, int, int]] = set()
+        self._book = TrackBook()
+        #: Tracks of runs of which nothing else has come yet: (when, message), a run.
+        self._tracks: dict[int, list[tuple[int, bytes]]] = {}
+        self._over: set[int] = set()
         self._flushed_s = 0.0
         self._open(Path(p.out))
         self.inlets.extend(dict.fromkeys(inlet for inlet, _ in self._flows.values()))
+        self._recorded: set[str] = set()
+        self._all = p.topics == "all"
         for topic in topics_to_record(p.topics):
             self._record(topic)
+
+    # Bags
 
     def _open(self, out: Path) -> None:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -103,19 +121,32 @@ class BagRecorderNode(CsasNode):
             lock.close()
             raise BagError(f"{out} is being recorded by another process") from None
         self._lock = lock
-        cut = out.with_name(f"{out.name}.cut")
-        finished = (out / "metadata.yaml").exists()
-        if out.exists() and (self.parameters.resume or not finished):
+        # A killed recorder leaves the bag of its last run without an end: that one is gone on with.
+        last = out
+        for number in range(2, _MOST_RUNS):
+            if not _bag_of_run(out, number).exists():
+                break
+            last = _bag_of_run(out, number)
+        path = out if last == out or (last / "metadata.yaml").exists() else last
+        self._open_bag(path)
+
+    def _open_bag(self, path: Path) -> RunBag:
+        cut = path.with_name(f"{path.name}.cut")
+        finished = (path / "metadata.yaml").exists()
+        if path.exists() and (self.parameters.resume or not finished):
             # A recorder was killed here: its bag has no end. Or it was ended, and is to go on. What the bag
             # holds goes into the new one.
             if cut.exists():
-                raise BagError(f"{cut} and {out} are both unfinished; expected one of them at most")
-            out.rename(cut)
-        self.writer = BagWriter(out, compress=self.parameters.compress)
+                raise BagError(f"{cut} and {path} are both unfinished; expected one of them at most")
+            path.rename(cut)
+        fast = self.parameters.compress and self.parameters.compression == "lz4"
+        bag = RunBag(path, BagWriter(path, compress="lz4" if fast else self.parameters.compress))
+        self._bags.append(bag)
         if cut.exists():
-            self._take_over(cut)
+            self._take_over(bag, cut)
+        return bag
 
-    def _take_over(self, cut: Path) -> None:
+    def _take_over(self, bag: RunBag, cut: Path) -> None:
         try:
             reader = BagReader(cut)
         except BagError as error:
@@ -125,71 +156,154 @@ class BagRecorderNode(CsasNode):
         prefix = f"{namespace}/"
         for message in reader.messages():
             relative = message.topic.removeprefix(prefix)
-            if relative in TOPICS:
-                self._write(relative, bytes(message.cdr), message.log_time_ns, report=False)
-        self.get_logger().info(f"took over {len(self._seen)} messages of an unfinished recording")
+            if is_topic(relative):
+                if relative == "track":
+                    self._learn(bytes(message.cdr))
+                self._write(bag, relative, bytes(message.cdr), message.log_time_ns, report=False)
+        bag.run_ns = next(iter(self._book.names), None)
+        self.get_logger().info(f"took over {len(bag.seen)} messages of an unfinished recording")
         for file in cut.iterdir():
             file.unlink()
         cut.rmdir()
 
+    def _close_bag(self, bag: RunBag) -> None:
+        self._bags.remove(bag)
+        if bag.run_ns is not None:
+            self._over.add(bag.run_ns)
+        bag.writer.close()
+
+    # Which bag
+
+    def _learn(self, cdr: bytes) -> int:
+        piece = track_piece_from_msg(message_from_cdr(cdr, TOPICS["track"].type_name, "track"))
+        name = self._book.add(piece)
+        for before, after in self._book.renamed.items():
+            for bag in self._bags:
+                bag.run_ns = after if bag.run_ns == before else bag.run_ns
+            if before in self._tracks:
+                self._tracks.setdefault(after, []).extend(self._tracks.pop(before))
+        return name
+
+    def _take(self, topic: str, cdr: bytes) -> None:
+        """Write a message into the bag of the run that its stamp is of."""
+        when = time.time_ns()
+        if not self._bags:
+            return
+        newest = self._bags[-1]
+        if topic == "track":
+            name = self._learn(cdr)
+            if newest.run_ns is None:
+                newest.run_ns = name
+            for bag in self._bags:
+                if bag.run_ns == name:
+                    self._write(bag, topic, cdr, when)
+                    return
+            self._tracks.setdefault(name, []).append((when, cdr))
+            return
+        stamp = None if topic in _NEVER_ALIKE else message_stamp(cdr, topic)
+        run_ns = None if stamp is None else self._book.run_of(stamp)
+        if run_ns in self._over:
+            raise BagError(f"{topic} of the run of {run_ns} ns came after its bag was finished; not recorded")
+        for bag in self._bags:
+            if run_ns == bag.run_ns:
+                self._write(bag, topic, cdr, when)
+                break
+        else:
+            bag = newest
+            if run_ns is not None and newest.run_ns is not None:
+                bag = self._begin_run(run_ns)
+            self._write(bag, topic, cdr, when)
+        if topic in _ENDS_THE_RUN_BEFORE:
+            for older in self._bags[: self._bags.index(bag)]:
+                self._close_bag(older)
+
+    def _begin_run(self, run_ns: int) -> RunBag:
+        """Open the bag of another run; that of the run before stays open until the new one has results."""
+        out = Path(self.parameters.out)
+        number = next(n for n in range(2, _MOST_RUNS) if not _bag_of_run(out, n).exists())
+        bag = self._open_bag(_bag_of_run(out, number))
+        bag.run_ns = run_ns
+        self.get_logger().info(f"the run of {run_ns} ns is recorded into {bag.path}")
+        while len(self._bags) > 2:
+            self._close_bag(self._bags[0])
+        for when, cdr in self._tracks.pop(run_ns, ()):
+            self._write(bag, "track", cdr, when)
+        return bag
+
     def _record(self, topic: str) -> None:
-        profile = qos.UNLATCHED if topic in ("progress", "/diagnostics") else qos.VIEWS
+        if topic in self._recorded:
+            return
+        self._recorded.add(topic)
 
         def take(cdr: Any) -> None:
-            self._write(topic, cdr, time.time_ns())
+            self._take(topic, cdr)
 
-        if topic in _LATCHED:
-            self.subscribe_latched(topic, take, raw=True)
+        if is_latched(topic):
+            profile = qos.TRACK if topic == "track" else qos.LATCHED
+            self.subscribe_latched(topic, take, raw=True, profile=profile)
         else:
-            self.subscribe(topic, profile, take, raw=True)
+            self.subscribe(topic, qos.UNLATCHED if topic in _NEVER_ALIKE else qos.VIEWS, take, raw=True)
 
-    def _write(self, topic: str, cdr: bytes, when: int, *, report: bool = True) -> None:
-        if self.writer is None:
-            return
-        stamp = header_stamp(cdr, topic)
+    def _write(self, bag: RunBag, topic: str, cdr: bytes, when: int, *, report: bool = True) -> None:
+        stamp = message_stamp(cdr, topic)
         flow = self._flows.get(topic)
         # Results of the same stamp may differ, and a latched message comes by two subscriptions.
-        key = (topic, stamp, 0 if flow is not None else zlib.crc32(cdr))
-        if key in self._seen and topic not in _NEVER_ALIKE:
+        key = (topic, stamp or 0, 0 if flow is not None else zlib.crc32(cdr))
+        if key in bag.seen and topic not in _NEVER_ALIKE:
             self.counts["duplicates"] += 1
         else:
             name = absolute_name(topic, self.get_namespace())
-            latched = topic in _LATCHED
-            self.writer.add_topic(name, TOPICS[topic].type_name, depth=1 if latched else 100, latched=latched)
-            self.writer.write(name, cdr, when)
+            latched = is_latched(topic)
+            bag.writer.add_topic(
+                name, topic_of(topic).type_name, depth=1 if latched else 100, latched=latched
+            )
+            bag.writer.write(name, cdr, when)
             self.counts["written"] += 1
             if topic not in _NEVER_ALIKE:
-                self._seen.add(key)
-        if flow is not None:
+                bag.seen.add(key)
+        if flow is not None and stamp is not None:
             inlet, is_info = flow
             if report:
                 self.counts["in"] += not is_info
                 if stamp in inlet.stamps[not is_info]:
                     # On disk before it is said to be: nobody sends again what a killed recorder reported.
-                    self.writer.flush()
+                    bag.writer.flush()
                 inlet.wrote(stamp, is_info=is_info)
             else:
                 inlet.stamps[is_info].add(stamp)
 
     def on_activated(self) -> None:
         """Report what a killed recorder had recorded already."""
-        if self.writer is None:
+        if not self._bags:
             self.error = f"{self.parameters.out} is finished; clean up and configure again for another bag"
         for inlet in self.inlets:
             if isinstance(inlet, RecordingInlet):
                 inlet.report_taken_over()
 
+    def state_values(self) -> dict[str, str]:
+        """Return the run that is recorded, and into which bag."""
+        if not self._bags:
+            return {}
+        bag = self._bags[-1]
+        return {"bag": str(bag.path)} | ({} if bag.run_ns is None else {"run": str(bag.run_ns)})
+
     def tick(self) -> None:
-        """See to it that a crash costs little."""
-        if self.writer is not None and time.monotonic() - self._flushed_s > _FLUSH_S:
+        """See to it that a crash costs little; record further objects' topics as they appear."""
+        if self._bags and time.monotonic() - self._flushed_s > _FLUSH_S:
             self._flushed_s = time.monotonic()
-            self.writer.flush()
+            for bag in self._bags:
+                bag.writer.flush()
+            if self._all:
+                prefix = f"{absolute_name('', self.get_namespace()).rstrip('/')}/"
+                for name, _ in self.get_topic_names_and_types():
+                    relative = name.removeprefix(prefix)
+                    if relative != name and split_prefix(relative)[0] and is_topic(relative):
+                        self._record(relative)
 
     def finish(self) -> None:
-        """Finish the bag: its metadata come last, and at once."""
-        if self.writer is not None:
-            writer, self.writer = self.writer, None
-            writer.close()
+        """Finish the bags: their metadata come last, and at once."""
+        for bag in list(self._bags):
+            self._close_bag(bag)
         if self._lock is not None:
             self._lock.close()
             self._lock = None

@@ -32,6 +32,7 @@ from rclpy.subscription import Subscription
 
 from csas_shadow_ros.core.errors import CsasError, ParameterError
 from csas_shadow_ros.core.geometry import View
+from csas_shadow_ros.core.search.decision import Decision
 from csas_shadow_ros.core.volume import Target
 from msg_adapters import (
     TOPICS,
@@ -39,8 +40,10 @@ from msg_adapters import (
     Level,
     Pairer,
     RclpyMessages,
+    SearchMessage,
     TargetBox,
     ViewProgress,
+    decision_from_msg,
     diagnostics_to_msg,
     is_routine_report,
     message_from_cdr,
@@ -54,6 +57,7 @@ from msg_adapters import (
 )
 from msg_adapters.progress import INTEGRATED, PUBLISHED, REJECTED
 from msg_adapters.topics import stream as stream_of
+from msg_adapters.topics import topic as topic_of
 
 from . import qos
 from .flow import Flow
@@ -133,6 +137,7 @@ class CsasNode(LifecycleNode):
         self.inlets: list[Inlet] = []
         self.sources: list[Source] = []
         self._owned: list[tuple[Callable[[Any], Any], Any]] = []
+        self._unlatched: list[Unlatched] = []
         self._logged: dict[str, tuple[float, int]] = {}
         self._rates: dict[str, tuple[int, float]] = {}
         self._beat_lock = threading.Lock()
@@ -179,7 +184,7 @@ class CsasNode(LifecycleNode):
 
     def publisher(self, topic: str, profile: Any, type_name: str | None = None) -> Publisher:
         """Make a publisher of a topic of the contract."""
-        made = self.create_publisher(self.messages.cls(type_name or TOPICS[topic].type_name), topic, profile)
+        made = self.create_publisher(self.messages.cls(type_name or topic_of(topic).type_name), topic, profile)
         self._owned.append((self.destroy_publisher, made))
         return made
 
@@ -192,7 +197,7 @@ class CsasNode(LifecycleNode):
             if self.active:
                 self.guard(topic, callback, msg)
 
-        kind = self.messages.cls(TOPICS[topic].type_name)
+        kind = self.messages.cls(topic_of(topic).type_name)
         made = self.create_subscription(kind, topic, guarded, profile, raw=raw)
         self._owned.append((self.destroy_subscription, made))
         return made
@@ -202,11 +207,22 @@ class CsasNode(LifecycleNode):
         self._owned.remove((self.destroy_subscription, subscription))
         self.destroy_subscription(subscription)
 
-    def subscribe_latched(self, topic: str, callback: Callable[[Any], None], *, raw: bool = False) -> None:
+    def subscribe_latched(
+        self,
+        topic: str,
+        callback: Callable[[Any], None],
+        *,
+        raw: bool = False,
+        profile: Any = qos.LATCHED,
+    ) -> None:
         """Subscribe to a latched topic, whether or not its publisher really latches it."""
-        self.subscribe(topic, qos.LATCHED, callback, raw=raw)
-        unlatched = Unlatched(self, topic, lambda: self.subscribe(topic, qos.UNLATCHED, callback, raw=raw))
-        self.every(_DURABILITY_S, unlatched.look)
+        self.subscribe(topic, profile, callback, raw=raw)
+        if not self._unlatched:
+            # One timer for all topics: a recorder follows dozens.
+            self.every(_DURABILITY_S, lambda: [one.look() for one in self._unlatched] and None)
+        self._unlatched.append(
+            Unlatched(self, topic, lambda: self.subscribe(topic, qos.UNLATCHED, callback, raw=raw))
+        )
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call back periodically while the node is configured."""
@@ -297,6 +313,12 @@ class CsasNode(LifecycleNode):
         with self._beat_lock:
             if self.active:
                 self._send_beats()
+
+    def leave(self, inlet: Inlet) -> None:
+        """Say goodbye for one inlet."""
+        with self._beat_lock:
+            self.inlets.remove(inlet)
+            self._heartbeats.publish(progress_to_msg(self.messages, inlet.beat(leaving=True)))
 
     def _send_beats(self, *, leaving: bool = False) -> None:
         voices: list[Inlet | Source] = [*self.inlets, *self.sources]
@@ -428,6 +450,7 @@ class CsasNode(LifecycleNode):
     def _destroy_owned(self) -> None:
         self.inlets.clear()
         self.sources.clear()
+        self._unlatched.clear()
         while self._owned:
             destroy, entity = self._owned.pop()
             destroy(entity)
@@ -556,7 +579,10 @@ class Inlet:
         Takes (image, camera_info) and returns the outcome to report, or None to report nothing.
         A `CsasError` that it raises refuses the view.
     hold : callable, optional
-        Says why no view can be worked on yet; such views wait for `release`, a window of them at most.
+        Says of a stamp why its view cannot be worked on yet, and for how long (s) it may wait; such views
+        wait for `release`, a window of them at most.
+    optional : bool
+        Nobody waits for this consumer as long as nobody publishes the stream.
     """
 
     def __init__(
@@ -565,23 +591,35 @@ class Inlet:
         stream: str,
         role: str,
         work: Callable[[Any, Any], str | None],
-        hold: Callable[[], str] | None = None,
+        hold: Callable[[int], tuple[str, float]] | None = None,
+        *,
+        optional: bool = False,
     ) -> None:
         self.node = node
         self.stream = stream
         self.role = role
+        self.optional = optional
         self.instance = f"{node.instance}-{stream}"
-        self.held: deque[tuple[Any, Any]] = deque(maxlen=qos.MAX_WINDOW)
+        self.held: deque[tuple[float, Any, Any]] = deque(maxlen=qos.MAX_WINDOW)
         self._work = work
-        self._hold = hold or (lambda: "")
+        self._hold = hold or (lambda _: ("", 0.0))
         kind = stream_of(stream)
         self._pairer = Pairer(kind.image_topic, capacity=qos.MAX_WINDOW)
         self._last_s = time.monotonic()
         self._seen: dict[int, None] = {}
         # Raw: of a message that rclpy decodes the pixels are copied twice more.
-        node.subscribe(kind.image_topic, qos.VIEWS, self._take_image, raw=True)
-        node.subscribe(kind.info_topic, qos.VIEWS, lambda msg: self._take(msg, is_info=True))
+        self._subscriptions = [
+            node.subscribe(kind.image_topic, qos.VIEWS, self._take_image, raw=True),
+            node.subscribe(kind.info_topic, qos.VIEWS, lambda msg: self._take(msg, is_info=True)),
+        ]
         node.inlets.append(self)
+
+    def close(self) -> None:
+        """Take no more of the stream; say goodbye, so that nobody waits."""
+        self.node.leave(self)
+        for subscription in self._subscriptions:
+            self.node.unsubscribe(subscription)
+        self._subscriptions.clear()
 
     def _take_image(self, cdr: bytes) -> None:
         topic = stream_of(self.stream).image_topic
@@ -594,10 +632,17 @@ class Inlet:
         if pair is None:
             return
         self.node.counts["in"] += 1
-        if self._hold():
-            self.held.append(pair)
-            return
-        self._work_on(*pair)
+        self._work_or_hold(time.monotonic(), *pair)
+
+    def _work_or_hold(self, since_s: float, image: Any, info: Any) -> None:
+        stamp = stamp_to_ns(image.header.stamp)
+        reason, patience_s = self._hold(stamp)
+        if not reason:
+            self._work_on(image, info)
+        elif time.monotonic() - since_s <= patience_s:
+            self.held.append((since_s, image, info))
+        else:
+            self._refuse(stamp, info, f"{self.stream} stamped {stamp} ns: {reason}; it is not used")
 
     def _work_on(self, image: Any, info: Any) -> None:
         stamp = stamp_to_ns(image.header.stamp)
@@ -606,14 +651,17 @@ class Inlet:
         try:
             outcome = self._work(image, info)
         except CsasError as error:
-            self.node.reject(str(error))
-            self.report(stamp, REJECTED, str(error), **self._aspect_of(info))
+            self._refuse(stamp, info, str(error))
             return
         self._seen[stamp] = None
         if len(self._seen) > 1 << 16:
             self._seen.pop(next(iter(self._seen)))
         if outcome is not None:
             self.report(stamp, outcome)
+
+    def _refuse(self, stamp: int, info: Any, reason: str) -> None:
+        self.node.reject(reason)
+        self.report(stamp, REJECTED, reason, **self._aspect_of(info))
 
     def _aspect_of(self, info: Any) -> dict[str, str]:
         """Say which aspect a refused view is of, as far as that is legible."""
@@ -624,9 +672,9 @@ class Inlet:
         return {"aspect_deg": f"{math.degrees(aspect):.6f}"}
 
     def release(self) -> None:
-        """Work on the views that were held."""
-        while self.held and not self._hold():
-            self._work_on(*self.held.popleft())
+        """Work on the views that were held, as far as they need not wait any longer."""
+        for _ in range(len(self.held)):
+            self._work_or_hold(*self.held.popleft())
 
     def report(self, stamp_ns: int, outcome: str, reason: str = "", **more: str) -> None:
         """Tell the sources what became of a view."""
@@ -643,18 +691,26 @@ class Inlet:
         self._pairer.orphans.clear()
 
     def give_up_lonely(self) -> None:
-        """Drop messages whose partner has not come while nothing else came either."""
+        """Drop messages whose partner has not come while nothing else came; refuse what waited long."""
+        if self.held:
+            self.release()
         if time.monotonic() - self._last_s > _LONELY_S:
             self._last_s = time.monotonic()
             self._pairer.flush()
             self._report_orphans()
+
+    def _idle(self) -> dict[str, str]:
+        """Say that nobody need wait for this consumer, as nobody publishes what it takes."""
+        # Right after the start this also means: not discovered yet.
+        published = not self.optional or self.node.count_publishers(stream_of(self.stream).image_topic)
+        return {} if published else {"idle": "true"}
 
     def _for_target(self) -> dict[str, str]:
         return {"target": self.node.target_stamp} if self.node.target_stamp else {}
 
     def beat(self, *, leaving: bool) -> Heartbeat:
         """Make the heartbeat."""
-        values = {"input": self.stream, **self._for_target(), **self.node.state_values()}
+        values = {"input": self.stream, **self._for_target(), **self.node.state_values(), **self._idle()}
         if leaving:
             values["leaving"] = "true"
         if self.node.error:
@@ -796,6 +852,8 @@ class Source:
             values["finished_for"] = " ".join(self.flow.finished_for())
             values["waiting_for"] = self.flow.waiting_for()
             values |= self.node.state_values()
+            if self.flow.target:
+                values["target"] = self.flow.target
         if self.node.error:
             values["error"] = self.node.error
         counts = self.node.common_counts() | self.counts()
@@ -833,64 +891,100 @@ class ViewOutlet:
 
 
 class TargetInlet:
-    """The target: given by parameter, or from topic `target`; never guessed.
+    """What is to be carved: given by parameter, or from topics `target` and `search`; never guessed.
 
     Parameters
     ----------
     node : CsasNode
         The node; its parameters say whether the target is given.
     on_known : callable
-        Called once it is known that there is a target, or that there is none; again when it has moved.
-    on_moved : callable, optional
-        Called before that when the target of a run that is still going on has moved: what was made of views
-        until then is of no use any more.
+        Called once it is known that there is a target, or that there is none; again when it is another one.
+    on_another : callable, optional
+        Called with `another_run` before that when another one takes the place of what is known: the target of
+        a run that is still going on has moved, or another run has begun.
     """
 
     def __init__(
-        self, node: CsasNode, on_known: Callable[[], None], on_moved: Callable[[], None] | None = None
+        self, node: CsasNode, on_known: Callable[[], None], on_another: Callable[..., None] | None = None
     ) -> None:
         p = node.parameters
         self._node = node
         self._on_known = on_known
-        self._on_moved = on_moved or (lambda: None)
-        #: Whether another target may follow and replace this one.
+        self._on_another = on_another or (lambda **_: None)
+        #: Whether another target of the same run may follow and replace this one.
         self.may_move = False
         self.known = p.target == "given"
-        self.target: Target | None = None
+        self.decision = Decision(None)
+        #: Name of the run that it is of; None where nobody says.
+        self.run_ns: int | None = None
+        self._searched: SearchMessage | None = None
+        self._early: Any = None
         if self.known:
             size = getattr(p, "size_m", (0.0, 0.0, 0.0))
-            self.target = Target((p.position_m[0], p.position_m[1]), (size[0], size[1], size[2]))
+            target = Target((p.position_m[0], p.position_m[1]), (size[0], size[1], size[2]))
+            self.decision = Decision(target)
         else:
             node.target_stamp = "0"
+            node.subscribe_latched("search", self._take_search)
             node.subscribe_latched("target", self._take)
+
+    @property
+    def target(self) -> Target | None:
+        """The body that the run is about; None: there is none, or it is not known."""
+        return self.decision.target
+
+    @property
+    def stamp(self) -> str:
+        """Stamp of the target, as reports name it; empty where it is given."""
+        return self._node.target_stamp
+
+    def _take_search(self, msg: Any) -> None:
+        self._searched = decision_from_msg(msg)
+        early, self._early = self._early, None
+        if early is not None:
+            self._take(early)
 
     def _take(self, msg: Any) -> None:
         box = target_from_msg(msg)
-        target = self._target_of(box)
-        stamp = str(stamp_to_ns(msg.header.stamp, "target.header.stamp"))
-        if not self.known or (self.may_move and target_may_move(msg) and stamp != self._node.target_stamp):
-            moved, self.known, self.target = self.known, True, target
-            self.may_move, self._node.target_stamp = target_may_move(msg), stamp
-            if moved:
-                self._on_moved()
-            self._on_known()
-        elif self._place(target) != self._place(self.target):
-            self._node.reject(
-                f"target moved to {self._place(target)} from {self._place(self.target)} during the run: the"
-                " first one is kept; clean up and configure again for another run"
-            )
+        stamp = stamp_to_ns(msg.header.stamp, "target.header.stamp")
+        searched = self._searched
+        if searched is None or searched.target_stamp_ns != stamp:
+            searched = None
+            if self._node.count_publishers("search"):
+                self._early = msg  # what else there is to carve comes at the same time
+                return
+        decision = Decision(self._target_of(box)) if searched is None else searched.decision
+        run_ns = None if searched is None else searched.run_ns
+        if str(stamp) == self._node.target_stamp:
+            if not decision.same_target(self.decision):
+                self._node.reject(f"target stamped {stamp} ns differs from another of the same stamp")
+            return
+        another_run = run_ns is not None and run_ns != self.run_ns
+        may_move = target_may_move(msg)
+        if self.known and not another_run and not (self.may_move and may_move):
+            if not decision.same_target(self.decision):
+                self._node.reject(
+                    f"target stamped {stamp} ns lies elsewhere than that of {self._node.target_stamp} ns, and"
+                    " nothing says that another run has begun: the first one is kept"
+                )
+            return
+        if self.known:
+            self._on_another(another_run=another_run)
+        self.known, self.decision, self.run_ns = True, decision, run_ns
+        self.may_move, self._node.target_stamp = may_move, str(stamp)
+        self._on_known()
 
     @staticmethod
     def _target_of(box: TargetBox | None) -> Target | None:
         return None if box is None else Target((box.centre_m[0], box.centre_m[1]), box.size_m)
 
-    @staticmethod
-    def _place(target: Target | None) -> object:
-        return None if target is None else (target.position_m, target.size_m)
-
     def missing(self) -> str:
         """Say why there is nothing to go by yet; empty once it is known."""
         return "" if self.known else "no target position: nothing came on topic target, and none is given"
+
+    def hold(self, _: int) -> tuple[str, float]:
+        """Let views wait until the target is known."""
+        return self.missing(), math.inf
 
 
 def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from csas_shadow_ros.core.composites import Composites
+from csas_shadow_ros.core.errors import ViewError
 from csas_shadow_ros.core.geometry import Acoustics
 from csas_shadow_ros.core.warm import warm_composites
 from msg_adapters import GroundInfo, Heartbeat, ground_picture_to_msgs, view_from_msgs
@@ -17,6 +18,7 @@ from msg_adapters.topics import stream as stream_of
 from . import qos
 from .base import INTEGRATED, CsasNode, Inlet, run_node
 from .growing import Growing
+from .runtime.runs import RunFollower
 
 _PICTURES = ("multilook", "color_by_aspect")
 
@@ -37,7 +39,8 @@ class CompositesNode(CsasNode):
             for name in _PICTURES
         }
         self.growing = Growing(self.publish_result, self.wanted, self.parameters.publish_hz)
-        self.inlet = Inlet(self, "sub_aperture", "sink", self.work)
+        self.runs = RunFollower(self, lambda *_: self.inlet.release())
+        self.inlet = Inlet(self, "sub_aperture", "sink", self.work, hold=self.runs.hold)
         self.follow_sources()
 
     @classmethod
@@ -47,6 +50,7 @@ class CompositesNode(CsasNode):
 
     def forget(self) -> None:
         """Drop the images."""
+        self.run_ns: int | None = None
         self.composites: Composites | None = None
         self.acoustics: Acoustics | None = None
 
@@ -57,8 +61,21 @@ class CompositesNode(CsasNode):
         return {"views": held, "complete": int(complete)}
 
     def work(self, image: Any, info: Any) -> str:
-        """Add one view."""
+        """Add one view; the first of another run begins anew."""
         view = view_from_msgs(image, info, "sub_aperture")
+        run_ns = self.runs.run_of(view.info.stamp_ns)
+        if run_ns is not None and run_ns != self.run_ns:
+            if self.run_ns is not None:
+                if run_ns < self.run_ns:
+                    raise ViewError(
+                        f"view stamped {view.info.stamp_ns} ns is of the run of {run_ns} ns; that of"
+                        f" {self.run_ns} ns has begun"
+                    )
+                if self.composites is not None and not self.growing.complete:
+                    self.growing.finish()
+                self.composites = None
+                self.growing.begin_again()
+            self.run_ns = run_ns
         if self.composites is None:
             self.composites, self.acoustics = Composites.for_view(view), view.info.acoustics
         if self.composites.integrate(view):
@@ -67,14 +84,19 @@ class CompositesNode(CsasNode):
 
     def on_source(self, beat: Heartbeat) -> None:
         """Finish once the source says that every view is here."""
-        if beat.values.get("stream") == "sub_aperture":
+        if beat.values.get("stream") == "sub_aperture" and self.has_begun(beat):
             self.growing.source_says(self.inlet.instance in beat.values.get("finished_for", "").split())
             self.tick()
+
+    def has_begun(self, beat: Heartbeat) -> bool:
+        """Say whether a source speaks of the run whose views are here, or of any where nobody names it."""
+        name = beat.values.get("run")
+        return name is None or self.run_ns is None or name == str(self.run_ns)
 
     def tick(self) -> None:
         """Publish what has changed."""
         before = self.growing.complete
-        self.growing.period_s = 1.0 / self.parameters.publish_hz
+        self.growing.set_rate(self.parameters.publish_hz)
         self.growing.tick(time.monotonic())
         if self.growing.complete and not before:
             self.tell_now()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 
@@ -28,7 +29,7 @@ class Growing:
     def __init__(self, publish: Callable[[], None], wanted: Callable[[], bool], hz: float) -> None:
         self._publish = publish
         self._wanted = wanted
-        self.period_s = 1.0 / hz
+        self.set_rate(hz)
         #: Whether all views are in and the result is published.
         self.complete = False
         #: Whether what is published is the end result, as far as anybody knows.
@@ -39,6 +40,10 @@ class Growing:
         self._source_s = -1e9
         self._cost_s = 0.0
 
+    def set_rate(self, hz: float) -> None:
+        """Publish an unfinished result so often at most; 0: never."""
+        self.period_s = 1.0 / hz if hz > 0.0 else math.inf
+
     def changed(self) -> None:
         """Say that the result has changed."""
         self._dirty, self.complete, self._changed_s = True, False, time.monotonic()
@@ -46,6 +51,16 @@ class Growing:
     def source_says(self, ended: bool) -> None:
         """Take a source's word whether every view has come."""
         self._source_s, self._ended = time.monotonic(), ended
+
+    def begin_again(self) -> None:
+        """Wait for another result; what was published stays as it is."""
+        self.complete = self.final = self._dirty = self._ended = False
+
+    def finish(self) -> None:
+        """Publish the end result now, whatever anybody has said."""
+        self.final = True
+        self._do(time.monotonic())
+        self.complete = True
 
     def tick(self, now: float) -> None:
         """Publish if it is time to."""

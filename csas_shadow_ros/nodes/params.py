@@ -15,6 +15,8 @@ from typing import Any, TypeVar
 
 from csas_shadow_ros.core.errors import ParameterError
 from csas_shadow_ros.core.parameters import (
+    MAX_OBJECTS,
+    MOST_OBJECTS,
     CarvingParameters,
     LikelihoodParameters,
     Parameters,
@@ -53,7 +55,11 @@ class SnapshotParameters(Parameters):
     """What nodes take that show their result while it grows."""
 
     publish_hz: float = bounded(
-        1.0, "most often that an unfinished result is published", low=0.01, high=20.0, unit="Hz"
+        1.0,
+        "most often that an unfinished result is published; 0: the end result alone",
+        low=0.0,
+        high=20.0,
+        unit="Hz",
     )
 
 
@@ -93,6 +99,9 @@ class SubApertureNodeParameters(NodeParameters, FlowParameters, TargetParameters
         high=360.0,
         unit="deg",
     )
+    max_objects: int = bounded(
+        MAX_OBJECTS, "bodies that are carved at most, the target among them", low=1, high=MOST_OBJECTS
+    )
 
 
 @dataclass(frozen=True)
@@ -106,8 +115,17 @@ class ShadowLikelihoodNodeParameters(NodeParameters, BoxParameters, LikelihoodPa
 
 
 @dataclass(frozen=True)
-class VoxelCarverNodeParameters(NodeParameters, SnapshotParameters, BoxParameters, CarvingParameters):
-    """Parameters of `voxel_carver`."""
+class VoxelCarverNodeParameters(
+    NodeParameters,
+    SnapshotParameters,
+    BoxParameters,
+    ShadowParameters,
+    LikelihoodParameters,
+    CarvingParameters,
+):
+    """Parameters of `voxel_carver`; those of earlier stages measure the target and make further bodies."""
+
+    compare: bool = bounded(False, "carve by the other method too, from likelihood/*, on other_method/*")
 
 
 @dataclass(frozen=True)
@@ -140,7 +158,10 @@ class BagRecorderNodeParameters(NodeParameters):
 
     out: str = bounded("", "bag to make: a directory that does not exist yet")
     resume: bool = bounded(False, "go on with a recording that is there already, instead of refusing it")
-    compress: bool = bounded(True, "compress with zstd")
+    compress: bool = bounded(True, "compress the bag")
+    compression: str = bounded(
+        "zstd", "zstd; lz4: a tenth larger, four times as fast", choices=("zstd", "lz4")
+    )
     topics: str = bounded("all", "topics to record, relative, separated by commas; all: the whole contract")
 
 

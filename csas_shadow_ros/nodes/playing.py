@@ -14,7 +14,9 @@ from csas_shadow_ros.core.errors import BagError, CsasError, ParameterError
 from msg_adapters import TOPICS, VIEW_STREAMS
 from msg_adapters.camera_info import sector_info_from_msg
 from msg_adapters.messages import NANOSECONDS
+from msg_adapters.topics import MARKERS
 from msg_adapters.topics import stream as stream_of
+from msg_adapters.topics import topic as topic_of
 
 #: Stages in the order in which a bag is searched for them.
 STAGES = ("image", "sector", "sub_aperture", "shadow", "likelihood", "shadow_mask")
@@ -36,6 +38,23 @@ def header_stamp(cdr: Any, where: str) -> int:
     if sec < 0 or nanosec >= NANOSECONDS:
         raise BagError(f"{where}: stamp is {sec} s {nanosec} ns; expected sec >= 0 and nanosec in [0, 1e9)")
     return int(sec) * NANOSECONDS + int(nanosec)
+
+
+def message_stamp(cdr: Any, topic: str) -> int | None:
+    """Read the stamp (ns) of a serialised message of the contract; None of an empty array of markers.
+
+    Raises
+    ------
+    BagError
+        See `header_stamp`.
+    """
+    if topic_of(topic).type_name != MARKERS:
+        return header_stamp(cdr, topic)
+    if len(cdr) < 8 or cdr[0] != 0 or cdr[1] > 1:
+        raise BagError(f"{topic}: {bytes(cdr[:4])!r}… ({len(cdr)} bytes) is no CDR message")
+    (count,) = struct.unpack_from("<I" if cdr[1] == 1 else ">I", cdr, 4)
+    # An array has no header of its own: its markers have.
+    return header_stamp(bytes(cdr[:4]) + bytes(cdr[8:20]), topic) if count else None
 
 
 def holds(reader: BagReader, relative: str) -> bool:

@@ -24,6 +24,9 @@ VIEWS = _profile(MAX_WINDOW, latched=False)
 #: Image, camera_info, track, target and results: the one current value, for whoever joins or restarts.
 LATCHED = _profile(1, latched=True)
 
+#: The track, which may come in pieces: a reader keeps several until it has time for them.
+TRACK = _profile(64, latched=True)
+
 #: The same topics from an outside publisher that does not latch: subscribed to besides `LATCHED`, since
 #: a transient_local subscription does not match a volatile publisher.
 UNLATCHED = _profile(8, latched=False)

@@ -6,8 +6,8 @@ import sys
 from typing import Any
 
 from csas_shadow_ros.core.errors import NoTargetError
-from csas_shadow_ros.core.parameters import ShadowParameters
-from csas_shadow_ros.core.shadow import enhance
+from csas_shadow_ros.core.parameters import PipelineParameters, ShadowParameters
+from csas_shadow_ros.core.pipeline import ProcessedView
 from csas_shadow_ros.core.warm import warm_enhancement
 from msg_adapters import view_from_msgs
 
@@ -22,9 +22,10 @@ class ShadowEnhancementNode(CsasNode):
 
     def setup(self) -> None:
         """Make the outlet before the inlet: what comes in can go out."""
+        self.pipeline = PipelineParameters(shadow=part(self.parameters, ShadowParameters))
         self.shadow = ViewOutlet(self, "shadow")
         self.target = TargetInlet(self, lambda: self.inlet.release())
-        self.inlet = Inlet(self, "sub_aperture", "stage", self.work, hold=self.target.missing)
+        self.inlet = Inlet(self, "sub_aperture", "stage", self.work, hold=self.target.hold)
 
     @classmethod
     def preload(cls) -> None:
@@ -40,8 +41,8 @@ class ShadowEnhancementNode(CsasNode):
         view = view_from_msgs(image, info, "sub_aperture")
         if self.target.target is None:
             raise NoTargetError("no target: topic target says that there is no object in the scene")
-        p = part(self.parameters, ShadowParameters)
-        self.shadow.send(enhance(view, self.target.target.position_m, p))
+        made = ProcessedView(self.target.target, self.pipeline, sub_aperture=view)
+        self.shadow.send(made.require("shadow"))
         return PUBLISHED
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from csas_shadow_ros.core.likelihood import outside_likelihood, view_levels
-from csas_shadow_ros.core.parameters import LikelihoodParameters
-from csas_shadow_ros.core.segmentation import segment_shadow
+from csas_shadow_ros.core.parameters import LikelihoodParameters, PipelineParameters
+from csas_shadow_ros.core.pipeline import ProcessedView
 from csas_shadow_ros.core.warm import warm_likelihood
 from msg_adapters import view_from_msgs
 
@@ -26,6 +25,7 @@ class ShadowLikelihoodNode(CsasNode):
 
     def setup(self) -> None:
         """Make the outlets before the inlet."""
+        self.pipeline = PipelineParameters(likelihood=part(self.parameters, LikelihoodParameters))
         self.likelihood = ViewOutlet(self, "likelihood")
         self.mask: ViewOutlet | None = None
         self.target = TargetInlet(self, self._open_mask)
@@ -54,14 +54,13 @@ class ShadowLikelihoodNode(CsasNode):
     def work(self, image: Any, info: Any) -> str:
         """Make the likelihood, and the mask, of one view."""
         view = view_from_msgs(image, info, "shadow")
-        p = part(self.parameters, LikelihoodParameters)
-        levels = view_levels(view, p)
+        made = ProcessedView(self.target.target, self.pipeline, shadow=view)
+        made.require("levels")  # a view without levels is refused, whoever takes what is made of it
         # The mask goes first: once the likelihood is in the grid the view may count as done.
-        target = self.target.target
-        if self.mask is not None and self.mask.wanted and target is not None:
-            self.mask.send(segment_shadow(view, target.position_m, p, levels, reach_m=target.reach_m))
+        if self.mask is not None and self.mask.wanted and self.target.target is not None:
+            self.mask.send(made.require("mask"))
         if self.likelihood.wanted:
-            self.likelihood.send(outside_likelihood(view, p, levels))
+            self.likelihood.send(made.require("likelihood"))
         return PUBLISHED
 
 

@@ -1,6 +1,9 @@
 """Node `sub_aperture`: makes the views of the full circle from the coherent image (section 3.1).
 
 It also finds the target and checks the spectrum's sign, since it is the one node that has the image.
+
+A mission circles one contact after another. Image, sectors and poses are sorted into runs by their stamps.
+One run's views are sent at a time, and the next one's once they have left the graph.
 """
 
 from __future__ import annotations
@@ -8,16 +11,16 @@ from __future__ import annotations
 import math
 import sys
 import time
+from dataclasses import dataclass, field
 from typing import Any
 
 from csas_shadow_ros.bags.check import ERROR, judge_band, judge_coverage, judge_geometry, judge_image
-from csas_shadow_ros.core.errors import CsasError, TrackError, ViewError
-from csas_shadow_ros.core.geometry import CoherentImage, Track
+from csas_shadow_ros.core.errors import CsasError, ViewError
+from csas_shadow_ros.core.geometry import CoherentImage
 from csas_shadow_ros.core.parameters import SubApertureParameters, TargetParameters
+from csas_shadow_ros.core.search.decision import Decision
 from csas_shadow_ros.core.streaming import Stream
-from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
-from csas_shadow_ros.core.target import choose_target, find_target, spectrum_sign_evidence
-from csas_shadow_ros.core.volume import Target
+from csas_shadow_ros.core.subaperture import SubApertures
 from csas_shadow_ros.core.warm import warm_sub_apertures
 from msg_adapters import (
     TOPICS,
@@ -25,17 +28,18 @@ from msg_adapters import (
     Pairer,
     TargetBox,
     coherent_image_from_msgs,
+    decision_to_msg,
     message_from_cdr,
     sector_from_msgs,
     stamp_to_ns,
     target_to_msg,
-    track_from_msg,
     view_to_msgs,
 )
 
 from . import qos
 from .base import INTEGRATED, CsasNode, Inlet, Source, run_node
 from .params import part
+from .runtime.runs import HOLD_S, RunFollower
 
 #: Counts of a stream that somebody should hear of, and what they mean.
 _IRREGULAR = {
@@ -43,29 +47,60 @@ _IRREGULAR = {
     "out_of_order": "came after later ones; the result is the same",
     "late": "came after views that it changes were made; all views are made again",
 }
-
 #: So long the search for the whole run's target waits at most for views that are due already.
 _DECIDE_S = 2.0
+#: Runs that may wait for the one whose views are sent: each holds a spectrum of the image's size.
+_MOST_WAITING = 2
+#: Images that may wait for a track that covers their stamp.
+_MOST_UNPLACED = 2
+
+
+@dataclass(eq=False)
+class Run:
+    """One circle of one contact, as far as it has come.
+
+    Parameters
+    ----------
+    name : int or None
+        Stamp of its track's first pose; None as long as there is no track.
+    stream : Stream
+        What can be made of it.
+    """
+
+    name: int | None
+    stream: Stream
+    #: Its full-circle image, until it has been held against the track; and that image's stamp.
+    image: CoherentImage | None = None
+    image_stamp: int | None = None
+    #: Why it cannot be processed at all; empty if it can.
+    failed: str = ""
+    revision: int = 0
+    #: Views that are due as soon as the views of the target before are done.
+    due: list[int] = field(default_factory=list)
+    target_sent: int = 0
+    #: When all sectors were here; None before, and once the whole run's target is decided on.
+    ended_s: float | None = None
+    refusals_sent: set[float] = field(default_factory=set)
 
 
 class SubApertureNode(CsasNode):
-    """Takes `image` or `sector/*`, and `track`; publishes `target` and `sub_aperture/*`."""
+    """Takes `image` or `sector/*`, and `track`; publishes `search`, `target` and `sub_aperture/*`."""
 
     name = "sub_aperture"
 
     def setup(self) -> None:
         """Make outlets, then inlets."""
         self.forget()
+        self.search = self.publisher("search", qos.LATCHED)
         self.target = self.publisher("target", qos.LATCHED)
         self.source = Source(self, "sub_aperture", self.send_view)
         self.pairer = Pairer("image", capacity=2)
         # Raw, as views are: hundreds of megabytes are not to be copied in vain.
         self.subscribe_latched("image", self.take_raw_image, raw=True)
         self.subscribe_latched("camera_info", lambda msg: self.take_image(msg, is_info=True))
-        self.subscribe_latched("track", self.take_track)
-        self.sector_inlet = Inlet(self, "sector", "sink", self.take_sector)
+        self.track = RunFollower(self, self.take_track)
+        self.sector_inlet = Inlet(self, "sector", "sink", self.take_sector, hold=self.track.hold)
         self.follow_sources()
-        self.beginning = self.background(self.begin)
         self.advancing = self.background(self.advance)
         self.every(0.05, self.look_again)
 
@@ -75,56 +110,63 @@ class SubApertureNode(CsasNode):
         warm_sub_apertures()
 
     def forget(self) -> None:
-        """Drop the run."""
-        self.image: CoherentImage | None = None
-        self.image_stamp: int | None = None
-        self.track: Track | None = None
-        #: A run that comes as sectors; None before the first one.
-        self.stream: Stream | None = None
-        self.revision = 0
-        #: Views of the stream that are due as soon as the views of the target before are done.
-        self.due: list[int] = []
-        self.target_sent = 0
-        self.source_ended = False
-        #: When all sectors were here; None before, and once the whole run's target is decided on.
-        self.ended_s: float | None = None
-        self.refusals_sent: set[float] = set()
+        """Drop all runs."""
+        #: Those that are not over, the one whose views are sent first.
+        self.runs: list[Run] = []
+        #: Names of those that are, and the stamps of their images.
+        self.over: dict[int | None, int | None] = {}
+        #: Images whose stamp no known track covers, and since when they wait.
+        self.unplaced: list[tuple[float, Any, Any]] = []
         self.sub_apertures: SubApertures | None = None
         self.aspects: dict[int, float] = {}
-        self.failed = False
+
+    @property
+    def run(self) -> Run | None:
+        """The run whose views are sent."""
+        return self.runs[0] if self.runs else None
+
+    # What to say of it
 
     def waiting(self) -> str:
         """Say which input is missing."""
-        if self.stream is not None and (text := self.waiting_of_stream(self.stream)):
-            return text
-        if self.sub_apertures is not None:
-            return self.source.flow.waiting_for() and f"waiting for {self.source.flow.waiting_for()}"
-        if self.stream is not None:
+        run = self.run
+        if run is None:
+            lacking = "track" if self.unplaced else "image" if self.track.book.names else "image and track"
+            if self.over:
+                return "" if not self.unplaced else "waiting for a track that covers the image's stamp"
+            return f"waiting for {lacking}"
+        if run.failed:
             return ""
-        missing = [n for n, x in (("image", self.image), ("track", self.track)) if x is None]
-        return f"waiting for {' and '.join(missing)}" if missing else ""
-
-    def waiting_of_stream(self, stream: Stream) -> str:
-        """Say what is missing of a run that comes as sectors."""
+        stream = run.stream
         if stream.track is None:
             return "waiting for track"
         arc = math.degrees(stream.sum.arcs.covered_rad)
         if not stream.target_known:
+            if stream.ended:
+                return "waiting for a track that goes round the circle"
             return f"waiting for more sectors to find the target in ({arc:.0f}° are here)"
-        if stream.ended and (missing := stream.missing()):
+        if stream.ended and run.image_stamp is None and (missing := stream.missing()):
             return f"no sectors came of {', '.join(map(str, missing))}"
         if self.source.flow.held:
             return "waiting until the views of the target before have left the graph"
-        return "" if stream.ended else f"waiting for more sectors ({arc:.0f}° are here)"
+        if stream.ended:
+            return self.source.flow.waiting_for() and f"waiting for {self.source.flow.waiting_for()}"
+        return f"waiting for more sectors ({arc:.0f}° are here)"
 
     def state_counts(self) -> dict[str, int]:
-        """Return how many sectors there are, how they came, and the arc that they cover."""
-        if self.stream is None:
-            return {"sectors": 0}
-        counts, arcs = self.stream.counts, self.stream.sum.arcs
+        """Return how many sectors there are, how they came, the arc that they cover, and the runs."""
+        run = self.run
+        state = {"sectors": 0, "runs_over": len(self.over), "runs_waiting": max(0, len(self.runs) - 1)}
+        if run is None or run.image_stamp is not None:
+            return state
+        counts, arcs = run.stream.counts, run.stream.sum.arcs
         names = ("sectors", "repeated", "out_of_order", "late")
-        state = {name if name == "sectors" else f"sectors_{name}": counts[name] for name in names}
-        return state | {"arc_deg": round(math.degrees(arcs.covered_rad)), "revision": self.stream.revision}
+        state |= {name if name == "sectors" else f"sectors_{name}": counts[name] for name in names}
+        return state | {"arc_deg": round(math.degrees(arcs.covered_rad)), "revision": run.stream.revision}
+
+    def state_values(self) -> dict[str, str]:
+        """Return the run's name."""
+        return {} if self.run is None or self.run.name is None else {"run": str(self.run.name)}
 
     # Inputs
 
@@ -137,226 +179,279 @@ class SubApertureNode(CsasNode):
         pair = self.pairer.add(msg, is_info=is_info)
         # A latched topic comes twice, by both subscriptions: its orphans are no news.
         self.pairer.orphans.clear()
-        if pair is None:
-            return
-        stamp = stamp_to_ns(pair[0].header.stamp, "image.header.stamp")
-        if self.failed and stamp != self.image_stamp:
-            # What came before could not be processed at all: this may be it put right.
-            self.failed, self.error, self.image_stamp = False, "", None
-        if self.image_stamp is not None:
-            if stamp != self.image_stamp:
-                raise ViewError(
-                    f"image stamped {stamp} ns came during the run of {self.image_stamp} ns; clean up and"
-                    " configure the node again for another run"
-                )
-            return
-        if self.stream is not None:
-            raise ViewError(f"image stamped {stamp} ns came during a run of sectors; it is not used")
-        self.image = coherent_image_from_msgs(*pair)
-        self.image_stamp = stamp
-        self.beginning.trigger()
+        if pair is not None:
+            self.place_image(*pair, time.monotonic())
 
-    def take_track(self, msg: Any) -> None:
-        """Take the track; of a track that grows during the run the longest is the whole."""
-        track = track_from_msg(msg)
-        if self.stream is not None:
-            if self.stream.take_track(track):
-                self.advancing.trigger()
-            self.track = self.stream.track
+    def place_image(self, image: Any, info: Any, since_s: float) -> None:
+        """Give an image to the run whose track covers its stamp; one without such a track waits."""
+        stamp = stamp_to_ns(image.header.stamp, "image.header.stamp")
+        reason, patience_s = self.track.image_hold(stamp)
+        if not reason:
+            self.take_run_image(self.track.run_of(stamp), stamp, image, info)
+        elif time.monotonic() - since_s > patience_s:
+            raise ViewError(f"image stamped {stamp} ns: {reason}; it is not used")
+        else:
+            self.unplaced = [
+                held for held in self.unplaced if stamp_to_ns(held[1].header.stamp) != stamp
+            ][1 - _MOST_UNPLACED :]
+            self.unplaced.append((since_s, image, info))
+
+    def take_run_image(self, name: int | None, stamp: int, image: Any, info: Any) -> None:
+        """Begin a run with its full-circle image."""
+        if name in self.over and self.over[name] == stamp:
             return
-        if self.sub_apertures is not None:
-            if len(track) > len(self.sub_apertures.track):
-                raise TrackError(
-                    f"a track of {len(track)} poses came after the views were begun with"
-                    f" {len(self.sub_apertures.track)}; it is not used"
-                )
+        run = self.run_named(name, f"image stamped {stamp} ns")
+        if run.failed and run.image_stamp != stamp:
+            # What came before could not be processed at all: this may be it put right.
+            self.runs[self.runs.index(run)] = run = self.new_run(name)
+            self.error = ""
+        if run.image_stamp == stamp:
             return
-        for level, problem, remedy in judge_coverage(track):
-            if level == ERROR:
-                raise TrackError(f"{problem}. {remedy}")
-        if self.track is None or len(track) >= len(self.track):
-            self.track = track
-            self.beginning.trigger()
+        if run.image_stamp is not None:
+            raise ViewError(
+                f"image stamped {stamp} ns came during the run of {run.image_stamp} ns, which is the same run"
+                " by its track; it is not used"
+            )
+        coherent = coherent_image_from_msgs(image, info)
+        run.stream.take_image(coherent)
+        run.image, run.image_stamp = coherent, stamp
+        self.advancing.trigger()
+
+    def take_track(self, name: int, renamed: dict[int, int]) -> None:
+        """Take what is known by now of a run's track."""
+        for run in self.runs:
+            if run.name is not None:
+                run.name = renamed.get(run.name, run.name)
+            if run.name is None and run.stream.sum.stamps:
+                run.name = self.track.run_of(min(run.stream.sum.stamps))
+            if run.name == name:
+                run.stream.take_track(self.track.book.track(name))
+        held, self.unplaced = self.unplaced, []
+        for since_s, image, info in held:
+            self.guard("image", self.place_image, image, info, since_s)
+        self.sector_inlet.release()
+        self.advancing.trigger()
 
     def take_sector(self, image: Any, info: Any) -> str:
         """Take one sector."""
         sector = sector_from_msgs(image, info)
-        if self.image_stamp is not None:
+        name = self.track.run_of(sector.stamp_ns)
+        if name in self.over:
+            if self.over[name] is not None:
+                return INTEGRATED  # that run was here as a whole
+            raise ViewError(f"sector at {sector.stamp_ns} ns came after the run of {name} ns was over")
+        run = self.run_named(name, f"sector at {sector.stamp_ns} ns")
+        if run.image_stamp is not None:
             return INTEGRATED  # the run is here as a whole
-        if self.stream is None:
-            p = self.parameters
-            self.stream = Stream(
-                part(p, SubApertureParameters),
-                part(p, TargetParameters),
-                first_search_deg=p.first_search_deg,
-            )
-            if self.track is not None:
-                self.stream.take_track(self.track)
-            self.source.flow.more_to_come = True
-        before = dict(self.stream.counts)
-        self.stream.add(sector)
-        for name, what in _IRREGULAR.items():
-            if self.stream.counts[name] > before.get(name, 0):
-                self.log_throttled(name, f"sector at {sector.stamp_ns} ns {what}", "warn")
+        before = dict(run.stream.counts)
+        run.stream.add(sector)
+        for kind, what in _IRREGULAR.items():
+            if run.stream.counts[kind] > before.get(kind, 0):
+                self.log_throttled(kind, f"sector at {sector.stamp_ns} ns {what}", "warn")
         self.advancing.trigger()
         return INTEGRATED
 
+    def run_named(self, name: int | None, what: str) -> Run:
+        """Return a run that is not over, beginning it if need be."""
+        for run in self.runs:
+            if run.name == name:
+                return run
+        if name in self.over:
+            raise ViewError(f"{what} came after the run of {name} ns was over; it is not used")
+        if len(self.runs) > _MOST_WAITING:
+            raise ViewError(
+                f"{what} begins another run while {_MOST_WAITING} wait for that of {self.runs[0].name} ns;"
+                " it is not used"
+            )
+        run = self.new_run(name)
+        self.runs.append(run)
+        return run
+
+    def new_run(self, name: int | None) -> Run:
+        """Make a run."""
+        p = self.parameters
+        stream = Stream(
+            part(p, SubApertureParameters),
+            part(p, TargetParameters),
+            first_search_deg=p.first_search_deg,
+            max_objects=p.max_objects,
+        )
+        if name is not None:
+            stream.take_track(self.track.book.track(name))
+        return Run(name, stream)
+
     def on_source(self, beat: Heartbeat) -> None:
         """Close the run once the source of the sectors says that they are all here."""
-        if self.stream is None or beat.values.get("stream") != "sector":
+        if not self.runs or beat.values.get("stream") != "sector":
             return
+        run = self.runs[-1]
         here = self.sector_inlet.instance in beat.values.get("finished_for", "").split()
-        if here and not self.source_ended:
-            self.source_ended = True
-            self.stream.finish()
+        if here and not run.stream.ended:
+            run.stream.finish()
             self.advancing.trigger()
 
-    # A run that comes as sectors
+    # One run after another
 
     def advance(self) -> None:
         """Offer the views that can be made by now; begin again where the target or the views have changed."""
-        stream, flow = self.stream, self.source.flow
-        if stream is None or self.failed:
-            self.ended_s = None
+        run, flow = self.run, self.source.flow
+        if run is None:
             return
-        decide = self.decides(stream)
+        if len(self.runs) > 1 and not run.stream.ended:
+            run.stream.finish()  # the vehicle is at the next one
+        if run.failed:
+            run.ended_s = None
+            self.go_on(run)
+            return
+        stream = run.stream
+        decide = self.decides(run)
         try:
-            if decide or not stream.ended:
-                self.judge_stream(stream)
+            if (decide or not stream.ended) and not self.judge(run):
+                return
             due = stream.update(decide=decide)
         except CsasError as error:
-            self.fail(error)
+            self.fail(run, error)
             return
         if not stream.target_known:
+            self.go_on(run)
             return
-        if stream.revision != self.revision or not self.target_sent:
-            self.revision, self.due, flow.held = stream.revision, [], True
-        self.due += due
+        if stream.revision != run.revision or not run.target_sent:
+            run.revision, run.due, flow.held = stream.revision, [], True
+        run.due += due
         if flow.held:
             self.begin_again()
         else:
-            self.offer_due(stream)
+            self.offer_due(run)
+        self.go_on(run)
 
-    def decides(self, stream: Stream) -> bool:
+    def decides(self, run: Run) -> bool:
         """Say whether it is time to decide on the whole run's target, once all sectors are here.
 
         The search takes a second. Views that are due already, and whoever looks at the grid, need not wait
         for it, unless they wait for something else themselves.
         """
+        stream = run.stream
         if not stream.ended or stream.final or not stream.target_known:
-            self.ended_s = None
+            run.ended_s = None
             return True
-        if self.ended_s is None:
-            self.ended_s = time.monotonic()
+        if run.ended_s is None:
+            run.ended_s = time.monotonic()
             return False  # the last sector's views are not even offered yet
-        return not self.source.flow.pending or time.monotonic() - self.ended_s > _DECIDE_S
+        return not self.source.flow.pending or time.monotonic() - run.ended_s > _DECIDE_S
 
     def look_again(self) -> None:
         """Go on with what waits until views that are on their way have left the graph."""
-        if self.ended_s is not None:
+        if (self.run is not None and self.run.ended_s is not None) or len(self.runs) > 1:
             self.advancing.trigger()
         self.begin_again()
 
+    def tick(self) -> None:
+        """Refuse by name what has waited too long for its track."""
+        held, self.unplaced = self.unplaced, []
+        for since_s, image, info in held:
+            if time.monotonic() - since_s > HOLD_S:
+                self.guard("image", self.place_image, image, info, since_s)
+            else:
+                self.unplaced.append((since_s, image, info))
+
     def begin_again(self) -> None:
         """Publish another target, and offer its views, once those of the one before have left the graph."""
-        stream, flow = self.stream, self.source.flow
-        if stream is None or not flow.held or flow.in_flight:
+        run, flow = self.run, self.source.flow
+        if run is None or not flow.held or flow.in_flight:
             return
-        self.target_sent = max(stream.sum.newest_ns, self.target_sent + 1)
-        self.publish_target(stream.target, self.target_sent, may_move=True)
-        flow.begin_again(str(self.target_sent))
+        stream = run.stream
+        if stream.decision is None:
+            return
+        whole = run.image_stamp is not None
+        run.target_sent = max(stream.sum.newest_ns, run.target_sent + 1)
+        self.publish_decision(stream.decision, run, may_move=not whole)
+        flow.begin_again(str(run.target_sent))
         self.aspects, flow.held = {}, False
-        self.offer_due(stream)
+        self.offer_due(run)
 
-    def offer_due(self, stream: Stream) -> None:
+    def offer_due(self, run: Run) -> None:
         """Offer the views that are due."""
-        flow = self.source.flow
+        flow, stream = self.source.flow, run.stream
         self.sub_apertures = stream.sub_apertures
-        if self.due:
-            self.aspects |= {stamp: stream.aspect_of(stamp) for stamp in self.due}
-            flow.offer(self.due)
-            self.due = []
+        if run.due:
+            self.aspects |= {stamp: stream.aspect_of(stamp) for stamp in run.due}
+            flow.offer(run.due)
+            run.due = []
             self.source.wake()
         if stream.final:
             for aspect, reason in stream.refused.items():
-                if aspect not in self.refusals_sent:
-                    self.refusals_sent.add(aspect)
-                    self.source.refused(self.target_sent, reason, aspect_deg=f"{math.degrees(aspect):.6g}")
+                if aspect not in run.refusals_sent:
+                    run.refusals_sent.add(aspect)
+                    self.source.refused(run.target_sent, reason, aspect_deg=f"{math.degrees(aspect):.6g}")
         flow.more_to_come = not stream.final
 
-    def judge_stream(self, stream: Stream) -> None:
-        """Raise if image and track contradict each other; of the whole run also by what the image shows."""
-        if stream.track is None or not stream.sum.stamps or stream.final:
+    def go_on(self, run: Run) -> None:
+        """Begin the next run once this one's views have left the graph, or it cannot be processed."""
+        flow, stream = self.source.flow, run.stream
+        if len(self.runs) < 2:
             return
+        hopeless = bool(run.failed) or (stream.ended and not stream.target_known)
+        through = stream.final and not run.due and not flow.held and (flow.finished or not flow.total)
+        if not (hopeless or through):
+            return
+        if hopeless and not run.failed:
+            self.reject(f"the run of {run.name} ns is given up: {self.waiting() or 'it has no views'}")
+        self.over[run.name] = run.image_stamp
+        while len(self.over) > 16:
+            self.over.pop(next(iter(self.over)))
+        self.runs.pop(0)
+        self.error = ""
+        flow.held = True
+        self.get_logger().info(f"the run of {self.runs[0].name} ns begins")
+        self.advancing.trigger()
+
+    def judge(self, run: Run) -> bool:
+        """Say whether image and track may belong together, as far as that is known; raise if they cannot."""
+        stream = run.stream
+        if stream.track is None or not stream.sum.stamps or stream.final:
+            return True
+        found = []
         frame = stream.sum.frame
-        if stream.ended:
+        if run.image_stamp is not None and run.image is not None:
+            for level, problem, remedy in judge_coverage(stream.track):
+                if level == ERROR:
+                    # It may still grow.
+                    self.log_throttled("coverage", f"track: {problem}. {remedy}", "warn")
+                    return False
+            found = [*judge_image(run.image, stream.track)]
+        elif run.image_stamp is None and stream.ended:
             found = [*judge_image(stream.sum.image(), stream.track)]
-        else:
+        elif run.image_stamp is None:
             found = [*judge_geometry(frame.grid, stream.track)]
             found += judge_band(frame.grid, frame.acoustics, stream.track)
         for level, problem, remedy in found:
             if level == ERROR:
                 raise ViewError(f"{problem}. {remedy}")
-
-    # Views
-
-    def begin(self) -> None:
-        """Find the target and list the views, once image and track are both here."""
-        if self.image is None or self.track is None or self.sub_apertures is not None or self.failed:
-            return
-        try:
-            for level, problem, remedy in judge_image(self.image, self.track):
-                if level == ERROR:
-                    raise ViewError(f"{problem}. {remedy}")
-            spectrum = Spectrum.of_image(self.image)
-            target = self.find_target(self.image, self.track, spectrum)
-            p = part(self.parameters, SubApertureParameters)
-            self.sub_apertures = SubApertures(self.image, self.track, p, spectrum=spectrum)
-        except CsasError as error:
-            self.fail(error)
-            return
-        self.publish_target(target, self.image_stamp or 0)
-        self.list_views(self.sub_apertures)
         # Its spectrum is all that the views are made of: the pixels need not stay in memory.
-        self.image = None
+        run.image = None
+        return True
 
-    def fail(self, error: CsasError) -> None:
+    def fail(self, run: Run, error: CsasError) -> None:
         """Say that the run cannot be processed at all: once, and in every heartbeat."""
-        self.failed, self.error = True, f"{type(error).__name__}: {error}"
+        run.failed, run.image = f"{type(error).__name__}: {error}", None
+        self.error = run.failed
         self.get_logger().error(self.error)
+        self.go_on(run)
 
-    def publish_target(self, target: Target | None, stamp: int, *, may_move: bool = False) -> None:
-        """Publish the volume to carve, or that there is no object."""
-        box = None
+    def publish_decision(self, decision: Decision, run: Run, *, may_move: bool) -> None:
+        """Publish what is carved, and the target's volume for whoever knows that topic alone."""
+        stamp = run.target_sent
+        # First, so that whoever takes the target knows what else there is.
+        self.search.publish(
+            decision_to_msg(self.messages, decision, stamp, run.name, stamp, may_move=may_move)
+        )
+        box, target = None, decision.target
         if target is not None:
             x, y = target.position_m
             box = TargetBox((x, y, target.size_m[2] / 2.0), target.size_m)
         self.target.publish(target_to_msg(self.messages, box, stamp, may_move=may_move))
 
-    def find_target(self, image: CoherentImage, track: Track, spectrum: Spectrum) -> Target | None:
-        """Find the target as the in-process pipeline does."""
-        p = part(self.parameters, TargetParameters)
-        if not self.parameters.check_sign:
-            return find_target(image, track, p, spectrum=spectrum)
-        sign, search = spectrum_sign_evidence(image, track, spectrum=spectrum)
-        sign.check()
-        return choose_target(search, p)
-
-    def list_views(self, sub_apertures: SubApertures) -> None:
-        """Offer every view that the track allows; name the others."""
-        for aspect in map(float, sub_apertures.aspects_rad):
-            degrees = f"{math.degrees(aspect):.6g}"
-            try:
-                stamp = sub_apertures.info(aspect).stamp_ns
-                if stamp in self.aspects:
-                    raise ViewError(f"view of aspect {degrees}° has the stamp {stamp} ns of another view")
-            except ViewError as error:
-                # It has no stamp of its own: the sonar never was there.
-                self.source.refused(self.image_stamp or 0, str(error), aspect_deg=degrees)
-                continue
-            self.aspects[stamp] = aspect
-        self.source.flow.offer(self.aspects)
-        self.source.wake()
+    # Views
 
     def send_view(self, stamp: int) -> None:
         """Make and publish the view of a stamp."""

@@ -13,6 +13,7 @@ import queue
 import sys
 import threading
 import time
+from collections import deque
 from functools import partial
 from typing import Any
 
@@ -60,6 +61,8 @@ class CatchingUp(Inlet):
         self.node = node
         self.stream = stream
         self.role = "sink"
+        self.optional = False
+        self.held = deque()
         self.instance = f"{node.instance}-{stream}"
 
     def give_up_lonely(self) -> None:

@@ -1,53 +1,74 @@
-"""Node `voxel_carver`: carves the voxel grid, and publishes it, its voxels and its mesh (section 4)."""
+"""Node `voxel_carver`: carves the voxel grid, measures what it leaves, and publishes it (section 4)."""
 
 from __future__ import annotations
 
 import math
 import sys
 import time
+from functools import partial
 from typing import Any
 
-from numpy.typing import NDArray
 from rclpy.publisher import Publisher
 
-from csas_shadow_ros.core.arcs import Arc, Arcs
-from csas_shadow_ros.core.carving import Carver
-from csas_shadow_ros.core.errors import NoTargetError, ParameterError
+from csas_shadow_ros.core.errors import NoTargetError, ParameterError, ViewError
 from csas_shadow_ros.core.geometry import looks_at
-from csas_shadow_ros.core.mesh import Dimensions, measure, mesh_from_grid
-from csas_shadow_ros.core.parameters import CarvingParameters
-from csas_shadow_ros.core.segmentation import require_silhouette
-from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.parameters import (
+    CarvingParameters,
+    LikelihoodParameters,
+    PipelineParameters,
+    ShadowParameters,
+)
+from csas_shadow_ros.core.pipeline import ProcessedView, process
+from csas_shadow_ros.core.reconstruction import Reconstruction
+from csas_shadow_ros.core.shape.result import Result
 from csas_shadow_ros.core.warm import warm_carving
-from msg_adapters import Heartbeat, mesh_to_msg, view_from_msgs, voxel_grid_to_msgs, voxels_to_msg
+from msg_adapters import Heartbeat, result_to_msgs, view_from_msgs
+from msg_adapters.topics import RESULT_TOPICS
 
 from . import qos
 from .base import INTEGRATED, CsasNode, Inlet, TargetInlet, run_node
 from .growing import Growing
 from .params import part
+from .runtime.runs import RunFollower
+
+#: What of a view each stream brings for the target.
+_PARTS = {"shadow_mask": ("mask",), "likelihood": ("likelihood",), "shadow": ("levels", "look")}
 
 
 class VoxelCarverNode(CsasNode):
-    """Takes `likelihood/*` (soft) or `shadow_mask/*` (hard); publishes `voxel_grid/*`, `voxels`, `mesh`."""
+    """Takes `shadow_mask/*` (soft: `likelihood/*`) and `shadow/*`; publishes all that there is to say.
+
+    It carves by the one, and measures against the other: where a silhouette ends to a fraction of a pixel,
+    and which hollows no shadow shows. Where nobody publishes `shadow/*`, silhouettes are all that it goes by.
+    Further bodies it makes from `sub_aperture/*`, since the views behind it are focused on the target.
+    """
 
     name = "voxel_carver"
 
     def setup(self) -> None:
-        """Make publishers, then the inlet of the method's stream."""
+        """Make publishers, then the inlets of the method's streams."""
         p = self.parameters
         if p.target == "given" and not all(s > 0 for s in p.size_m):
             raise ParameterError(f"size_m is {list(p.size_m)}; expected x, y, z > 0 m with a given target")
         self.forget()
-        self.grid_image = self.publisher("voxel_grid/image", qos.LATCHED)
-        self.grid_info = self.publisher("voxel_grid/camera_info", qos.LATCHED)
-        self.views_image = self.publisher("voxel_views/image", qos.LATCHED)
-        self.views_info = self.publisher("voxel_views/camera_info", qos.LATCHED)
-        self.voxels = self.publisher("voxels", qos.LATCHED)
-        self.mesh = self.publisher("mesh", qos.LATCHED)
-        self.stream = "shadow_mask" if p.takes_masks else "likelihood"
-        self.target = TargetInlet(self, lambda: self.inlet.release(), self.begin_again)
-        self.inlet = Inlet(self, self.stream, "sink", self.work, hold=self.target.missing)
+        self.outlets: dict[str, Publisher] = {}
+        for name in RESULT_TOPICS:
+            self.outlet(name)
+        self.pipeline = PipelineParameters(
+            carving=part(p, CarvingParameters),
+            likelihood=part(p, LikelihoodParameters),
+            shadow=part(p, ShadowParameters),
+        )
         self.growing = Growing(self.publish_result, self.wanted, p.publish_hz)
+        self.runs = RunFollower(self, lambda *_: self.release())
+        self.target = TargetInlet(self, self.on_target, self.begin_again)
+        self.stream = "shadow_mask" if p.takes_masks else "likelihood"
+        self.inlet = self.inlet_of(self.stream)
+        # Without silhouettes the soft method has nothing to measure on.
+        beside = ["shadow", *(["likelihood"] if p.compare and p.takes_masks else [])]
+        for stream in [*beside, *([] if p.takes_masks else ["shadow_mask"])]:
+            self.inlet_of(stream, optional=True)
+        self.further: Inlet | None = None
         self.follow_sources()
         # More often than a node's own tick: a sector's last view is to be shown at once.
         self.every(0.02, self.show)
@@ -58,16 +79,76 @@ class VoxelCarverNode(CsasNode):
         warm_carving()
 
     def forget(self) -> None:
-        """Drop the grid."""
-        self.carver: Carver | None = None
-        self.object_voxels = 0
-        self.arcs = Arcs()
-        self.dimensions: Dimensions | None = None
+        """Drop the run."""
+        self.reconstruction: Reconstruction | None = None
+        self.result: Result | None = None
+        #: How many further objects were published.
+        self.further_shown = 0
 
-    def begin_again(self) -> None:
-        """Drop the grid of a target that has moved."""
-        self.forget()
-        self.growing.changed()
+    def inlet_of(self, stream: str, *, optional: bool = False) -> Inlet:
+        """Make the inlet of a stream."""
+        return Inlet(self, stream, "sink", partial(self.work, stream), hold=self.hold, optional=optional)
+
+    def outlet(self, name: str) -> Publisher:
+        """Return the publisher of a topic of the result; a further object's is made when it is needed."""
+        if name not in self.outlets:
+            self.outlets[name] = self.publisher(name, qos.LATCHED)
+        return self.outlets[name]
+
+    # Which target, and which run
+
+    def hold(self, stamp: int) -> tuple[str, float]:
+        """Let views wait until it is known what is carved, and which run they are of."""
+        reason = self.target.missing()
+        return (reason, math.inf) if reason else self.runs.hold(stamp)
+
+    def release(self) -> None:
+        """Work on views that have waited."""
+        for inlet in list(self.inlets):
+            inlet.release()
+
+    def on_target(self) -> None:
+        """Take views for the further bodies, if there are any."""
+        wanted = bool(self.target.decision.others)
+        if wanted and self.further is None:
+            self.further = self.inlet_of("sub_aperture", optional=True)
+            self.tell_now()
+        elif not wanted and self.further is not None:
+            self.further.close()
+            self.further = None
+        self.release()
+
+    def begin_again(self, *, another_run: bool) -> None:
+        """Drop what was made of a target that has moved; of a run that is over, publish the end first."""
+        if another_run and self.reconstruction is not None and not self.growing.complete:
+            self.growing.finish()
+        # What was published stays until there is something new to say.
+        self.reconstruction = self.result = None
+        self.growing.begin_again()
+
+    def of_run(self, stamp: int) -> Reconstruction:
+        """Return what a view of a stamp goes into."""
+        run_ns = self.runs.run_of(stamp)
+        given = self.parameters.target == "given"
+        mine = self.reconstruction.run_ns if self.reconstruction is not None else self.target.run_ns
+        if run_ns is not None and mine is not None and run_ns != mine:
+            if not given or run_ns < mine:
+                raise ViewError(
+                    f"view stamped {stamp} ns is of the run of {run_ns} ns; that of {mine} ns is carved"
+                )
+            self.begin_again(another_run=True)
+        if self.reconstruction is None:
+            name = self.target.run_ns if self.target.run_ns is not None and not given else run_ns
+            self.reconstruction = Reconstruction(
+                self.target.decision,
+                self.pipeline,
+                compare=self.parameters.compare,
+                compose=False,
+                run_ns=name,
+            )
+        return self.reconstruction
+
+    # What to say of it
 
     def waiting(self) -> str:
         """Say so if views wait for the target."""
@@ -75,94 +156,101 @@ class VoxelCarverNode(CsasNode):
 
     def state_counts(self) -> dict[str, int]:
         """Return how many views the grid holds, and whether that is all."""
-        held = len(self.carver.stamps) if self.carver else 0
+        made = self.reconstruction
         complete = hasattr(self, "growing") and self.growing.complete
-        arc = round(math.degrees(self.arcs.covered_rad))
-        return {"views": held, "complete": int(complete), "arc_deg": arc}
+        arc = round(math.degrees(made.arcs.covered_rad)) if made is not None else 0
+        return {"views": len(made.stamps) if made else 0, "complete": int(complete), "arc_deg": arc}
 
     def state_values(self) -> dict[str, str]:
-        """Return how large the object is as far as it has been seen."""
-        d = self.dimensions
-        if d is None:
-            return {}
-        return {name: f"{getattr(d, name):.3f}" for name in ("length_m", "width_m", "height_m")}
+        """Return the run's name, and how large the object is as far as it has been seen."""
+        made, result = self.reconstruction, self.result
+        values = {} if made is None or made.run_ns is None else {"run": str(made.run_ns)}
+        if result is None:
+            return values
+        values["verdict"], values["quality"] = result.verdict, result.quality.verdict
+        if result.quality.reasons:
+            values["reasons"] = "; ".join(result.quality.reasons)
+        if (d := result.dimensions) is not None:
+            values |= {name: repr(getattr(d, name)) for name in ("length_m", "width_m", "height_m")}
+        return values
 
-    def work(self, image: Any, info: Any) -> str | None:
-        """Integrate one view; one that is in already changes nothing."""
-        view = view_from_msgs(image, info, self.stream)
+    # Views
+
+    def work(self, stream: str, image: Any, info: Any) -> str | None:
+        """Take one stage of a view in; what is in already changes nothing."""
+        view = view_from_msgs(image, info, stream)
         target = self.target.target
         if target is None:
             raise NoTargetError("no target: topic target says that there is no object in the scene")
         if self.target.may_move and not looks_at(view.info, target.position_m):
             return None  # of the target before; the view of this one is on its way
-        if self.carver is None:
-            p = part(self.parameters, CarvingParameters)
-            self.carver = Carver(Volume.around(target.position_m, target.size_m, p.voxel_size_m), p)
-        if self.carver.integrate(require_silhouette(view) if self.stream == "shadow_mask" else view):
-            half = view.info.aperture_rad / 2.0
-            self.arcs.add(Arc(view.info.aspect_rad - half, 2.0 * half))
+        made = self.of_run(view.info.stamp_ns)
+        if stream == "sub_aperture":
+            made.add_others(process(view, stream, made.decision, self.pipeline))
+        elif made.add(ProcessedView(target, self.pipeline, **{stream: view}), parts=_PARTS[stream]):
             self.growing.changed()
         return INTEGRATED
 
     def on_source(self, beat: Heartbeat) -> None:
         """Finish once a source says that every view is here."""
-        if beat.values.get("stream") != "sector":
+        own = beat.values.get("target", self.target.stamp) == self.target.stamp
+        if beat.values.get("stream") != "sector" and own:
             self.growing.source_says(self.inlet.instance in beat.values.get("finished_for", "").split())
+
+    # Results
 
     def show(self) -> None:
         """Publish what has changed."""
         if not self.active:
             return
         before = self.growing.complete
-        self.growing.period_s = 1.0 / self.parameters.publish_hz
+        self.growing.set_rate(self.parameters.publish_hz)
         self.growing.tick(time.monotonic())
         if self.growing.complete and not before:
             self.tell_now()
-            views = len(self.carver.stamps) if self.carver else 0
-            found = f"an object of {self.object_voxels} voxels" if self.object_voxels else "no object"
-            self.get_logger().info(f"complete: {views} views, {found}; the result is published")
+            self.log_end()
+
+    def log_end(self) -> None:
+        """Say what the run has left."""
+        result = self.result
+        if result is None:
+            self.get_logger().info("complete: no view came; no object as far as anybody knows")
+            return
+        d = result.dimensions
+        found = result.verdict if d is None else f"{d.length_m:.3f} x {d.width_m:.3f} x {d.height_m:.3f} m"
+        name = "" if result.run_ns is None else f" of run {result.run_ns}"
+        self.get_logger().info(
+            f"complete{name}: {result.views_used} views, {found} ({result.quality.verdict}); it is published"
+        )
+        slope = result.grid.seabed if result.grid is not None else None
+        if slope is not None and slope.believed:
+            self.get_logger().info(
+                f"the seabed slopes by {math.degrees(slope.slope_rad):.1f}° against the track's level: the"
+                " sonar's heights were corrected"
+            )
 
     def wanted(self) -> bool:
         """Say whether anybody looks at unfinished results."""
-        return looked_at(self.grid_image, self.voxels, self.mesh)
+        return any(publisher.get_subscription_count() for publisher in self.outlets.values())
 
     def publish_result(self) -> None:
-        """Publish grid, voxels and mesh as they are; an unfinished one to those who look alone."""
-        if self.carver is None:
-            # Nothing came: no object as far as anybody knows.
-            self.mesh.publish(mesh_to_msg(self.messages, None, self.now_ns()))
-            return
-        # Until all views are here the first look does: the second goes through all the silhouettes again.
+        """Publish everything as it is; large messages of an unfinished result to those who look alone."""
         final = self.growing.final
-        grid = self.carver.grid() if final else self.carver.first_look()
-        if final and grid.seabed is not None and grid.seabed.believed:
-            self.get_logger().info(
-                f"the seabed slopes by {math.degrees(grid.seabed.slope_rad):.1f}° against the track's level:"
-                " the sonar's heights were corrected"
-            )
-        stamp = max(self.carver.stamps)
-        self.object_voxels = int(grid.occupied.sum())
-        pairs: dict[str, tuple[Publisher, Publisher, NDArray[Any]]] = {
-            "voxel_grid": (self.grid_info, self.grid_image, grid.likelihood),
-            "voxel_views": (self.views_info, self.views_image, grid.views),
-        }
-        for name, (info_publisher, image_publisher, values) in pairs.items():
-            if final or looked_at(info_publisher, image_publisher):
-                image, info = voxel_grid_to_msgs(self.messages, grid.volume, values, stamp, name)
-                info_publisher.publish(info)
-                image_publisher.publish(image)
-        if final or looked_at(self.voxels):
-            self.voxels.publish(voxels_to_msg(self.messages, grid, stamp))
-        mesh = mesh_from_grid(grid) if grid.occupied.any() else None
-        self.dimensions = measure(mesh) if mesh is not None else None
-        # A mesh of ten thousand triangles takes longer to write as a message than to carve from a view.
-        if final or looked_at(self.mesh):
-            self.mesh.publish(mesh_to_msg(self.messages, mesh, stamp))
+        made = self.reconstruction
+        if made is None:  # nothing came: no object as far as anybody knows
+            run_ns = self.target.run_ns
+            made = Reconstruction(self.target.decision, self.pipeline, compose=False, run_ns=run_ns)
+        result = self.result = made.result(final=final)
+        stamp = result.stamp_ns or self.now_ns()
 
+        def looked_at(name: str) -> bool:
+            return final or bool(self.outlet(name).get_subscription_count())
 
-def looked_at(*publishers: Publisher) -> bool:
-    """Say whether anybody subscribes to one of the topics."""
-    return any(publisher.get_subscription_count() for publisher in publishers)
+        for name, message in result_to_msgs(
+            self.messages, result, stamp_ns=stamp, wanted=looked_at, before=self.further_shown
+        ):
+            self.outlet(name).publish(message)
+        self.further_shown = len(result.further)
 
 
 def main() -> int:

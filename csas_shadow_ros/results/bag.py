@@ -48,6 +48,7 @@ class ResultBag:
         self._acoustics: Acoustics | None = None
         self._last_ns = 0
         self._adopted = False
+        self._file: Path | None = None
         names = [*_LATCHED, *(f"{s}/{kind}" for s in _LATCHED_STREAMS for kind in ("image", "camera_info"))]
         for name in names:
             self._writer.add_topic(absolute_name(name), TOPICS[name].type_name, depth=1)
@@ -98,11 +99,24 @@ class ResultBag:
         self._last_ns = max(self._last_ns, view.info.stamp_ns)
         self._acoustics = self._acoustics or view.info.acoustics
 
-    def adopt(self, recording: Path) -> None:
-        """Take over a recording of the node graph, which holds everything already."""
+    def adopt(self, recording: Path, *, whole: bool) -> None:
+        """Take over a recording of the node graph, which holds everything already.
+
+        Parameters
+        ----------
+        recording : Path
+            The bag.
+        whole : bool
+            It is taken as it is: its file becomes the result's. Otherwise it is copied, without results that
+            were replaced as they grew.
+        """
         from .recording import copy_recording
 
-        copy_recording(recording, self._writer)
+        files = list(recording.glob("*.mcap"))
+        if whole and len(files) == 1:
+            self._file = files[0].replace(self._folder / ".recorded.mcap")
+        else:
+            copy_recording(recording, self._writer)
         self._adopted = True
 
     def finish(self, result: Result) -> Path:
@@ -117,7 +131,7 @@ class ResultBag:
             self._write_result(result)
         self._writer.close()
         path = self._folder / self.FILE
-        self._writer.file.replace(path)
+        (self._file or self._writer.file).replace(path)
         shutil.rmtree(self._work)
         return path
 

@@ -139,10 +139,10 @@ class ResultsWriter:
         """Take one processed view for the figures alone."""
         self._keeper.add(view)
 
-    def adopt_bag(self, recording: Path) -> None:
-        """Take a recording of the node graph as ``result.mcap``."""
+    def adopt_bag(self, recording: Path, *, whole: bool = False) -> None:
+        """Take a recording of the node graph as ``result.mcap``; a whole one as it is."""
         if self._bag is not None:
-            self._bag.adopt(recording)
+            self._bag.adopt(recording, whole=whole)
 
     def finish(self, result: Result, context: Context) -> dict[str, Any]:
         """Write everything else and put the folder in its place.

@@ -2,41 +2,37 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bags import BagReader, Run, read_run
-from ..core.carving import Carver, KeptMask
-from ..core.errors import ViewError
-from ..core.geometry import GroundGrid, View
-from ..core.hollows import EchoLook
-from ..core.likelihood import view_levels
-from ..core.measurement import levels_of_mask, measure_object, silhouette_sides
+from msg_adapters import view_from_msgs
+from msg_adapters.topics import RESULT_TOPICS, split_prefix, stream
+
+from ..bags import BagReader
+from ..bags.index import BagIndex
+from ..bags.run import checked_messages
+from ..core.errors import CsasError
+from ..core.geometry import GroundGrid, View, wrap_angle
 from ..core.parameters import PipelineParameters
-from ..core.pipeline import Result, open_hollows
-from ..core.segmentation import require_silhouette
-from ..core.stages import StagedView, spread_views
+from ..core.pipeline import ProcessedView
+from ..core.shape.result import Result
 from .folder import ResultsWriter
 from .subject import SIX_ASPECTS_DEG
 
 if TYPE_CHECKING:
     from ..replay import ReplayResult
 
-#: Masks before the views that they were segmented in.
-_STAGES = {
-    "sub_aperture": "sub_aperture",
-    "shadow_mask": "mask",
-    "shadow": "shadow",
-    "likelihood": "likelihood",
-}
+#: Stages of the views that figures show.
+_STAGES = ("sub_aperture", "shadow", "likelihood", "shadow_mask")
 
 
 @dataclass(eq=False)
@@ -45,7 +41,7 @@ class RecordedComposites:
 
     grid: GroundGrid
     pictures: Mapping[str, NDArray[Any]]
-    stamps: set[int] = field(default_factory=set)
+    stamps: range  # how many views are in them is known, not which
 
     def multilook(self) -> NDArray[np.float32]:
         """Return the multi-look amplitude."""
@@ -56,11 +52,10 @@ class RecordedComposites:
         return np.asarray(self.pictures["color_by_aspect"], dtype=np.uint8)
 
 
-def adopt_replay(writer: ResultsWriter, replayed: ReplayResult, parameters: PipelineParameters) -> Result:
-    """Turn what a replay left, and its recording, into what the in-process pipeline would have left.
-
-    The grid, mesh, target and composites are the graph's own. The other method's grid (figure 8) is
-    carved from the recorded views, and hollows are told from their echoes.
+def adopt_replay(
+    writer: ResultsWriter, replayed: ReplayResult, parameters: PipelineParameters, *, whole: bool
+) -> Result:
+    """Take what the graph published, and its recording, for the results folder; nothing is computed again.
 
     Parameters
     ----------
@@ -70,98 +65,56 @@ def adopt_replay(writer: ResultsWriter, replayed: ReplayResult, parameters: Pipe
         With a recording.
     parameters : PipelineParameters
         Those of the replay.
+    whole : bool
+        The recording holds results at their end alone, and is taken as it is.
 
     Returns
     -------
     Result
     """
-    result = Result(
-        target=replayed.target,
-        grid=replayed.grid,
-        mesh=replayed.mesh,
-        dimensions=replayed.dimensions,
-        views_used=replayed.views_used,
-    )
+    began = time.perf_counter()
+    result = replayed.result
     for lost in replayed.rejected:
         if math.isfinite(lost.aspect_deg):
             result.rejected[lost.aspect_deg] = f"{lost.node}: {lost.reason}"
-    began = time.perf_counter()
     if replayed.recording is not None:
-        run = read_run(replayed.recording)
-        writer.adopt_bag(replayed.recording)
-        if replayed.grid is not None:
-            _adopt_views(writer, run, result, parameters)
-        stamps = _stamps(run, "sub_aperture")
-    else:
-        stamps = set()
+        _show_views(writer, replayed.recording, result, parameters)
+        writer.adopt_bag(replayed.recording, whole=whole)
     if replayed.composites_grid is not None and {"multilook", "color_by_aspect"} <= set(replayed.composites):
-        recorded: Any = RecordedComposites(replayed.composites_grid, replayed.composites, stamps)
+        recorded: Any = RecordedComposites(
+            replayed.composites_grid, replayed.composites, range(replayed.composed)
+        )
         result.composites = recorded
     result.timings_s = {"replay": replayed.seconds, "adopt": time.perf_counter() - began}
     return result
 
 
-def _stamps(run: Run, stage: str) -> set[int]:
-    return {view.info.stamp_ns for view in run.views(stage)} if run.counts.get(stage) else set()
-
-
-def _adopt_views(writer: ResultsWriter, run: Run, result: Result, p: PipelineParameters) -> None:
-    """Read the recorded views once by stage: levels, the other method's grid, and what the figures show."""
-    if result.grid is None:
-        return
-    held = [stage for stage in _STAGES if run.counts.get(stage)]
-    masks: dict[int, KeptMask] = {}
-    other = Carver(result.grid.volume, p.carving.other())
-    wanted = "shadow_mask" if other.parameters.takes_masks else "likelihood"
-    shown: dict[int, dict[str, View]] = {}
-    # Of the stage that says most of where a view looked, six; of the others, the same six.
-    first = "shadow" if "shadow" in held else held[0]
-    start = math.radians(SIX_ASPECTS_DEG[0])
-    for view in spread_views(run.views(first), len(SIX_ASPECTS_DEG), start):
-        shown[view.info.stamp_ns] = {}
-    for stage in held:
-        for view in run.views(stage):
-            stamp = view.info.stamp_ns
-            if stamp in shown:
-                shown[stamp][_STAGES[stage]] = view
-            try:
-                if stage == wanted:
-                    other.integrate(require_silhouette(view) if stage == "shadow_mask" else view)
-                if stage == "shadow_mask":
-                    masks[stamp] = KeptMask.of(view)
-                if stage == "shadow":
-                    levels = view_levels(view, p.likelihood)
-                    result.levels[stamp] = (levels.seabed_level, levels.contrast, levels.estimated)
-                    result.looks[stamp] = EchoLook.of(levels, view.info, result.grid.volume)
-                    if result.target is not None and stamp in masks:
-                        mask = masks.pop(stamp).view()
-                        sides = silhouette_sides(levels, mask, result.target.position_m)
-                        result.sides += [sides] if sides is not None else []
-            except ViewError:
-                continue  # named by the node that refused it
-            writer.note_view(view)
+def _show_views(
+    writer: ResultsWriter, recording: Path, result: Result, parameters: PipelineParameters
+) -> None:
+    """Read the views that figures show: of each stage those nearest to six aspects, and no others."""
+    aspects = {stamp: one.aspect_rad for stamp, one in result.evidence.items()}
+    stamps = {
+        min(aspects, key=lambda stamp: abs(float(wrap_angle(aspects[stamp] - math.radians(wanted)))))
+        for wanted in (SIX_ASPECTS_DEG if aspects else ())
+    }
+    shown: dict[int, dict[str, View]] = {stamp: {} for stamp in stamps}
+    with BagReader(recording) as reader:
+        index = BagIndex(reader)
+        for stage in _STAGES:
+            info = reader.topic(stream(stage).info_topic)
+            if info is None or not info.count:
+                continue
+            infos = {}
+            for _, message, stamp in checked_messages(reader, stream(stage).info_topic, lambda _: None):
+                if stamp in stamps:
+                    infos[stamp] = message
+            for stamp, read in index.places(stage, set(infos)).items():
+                with contextlib.suppress(CsasError):  # named by the node that refused it
+                    shown[stamp][stage] = view_from_msgs(read(), infos[stamp], stage)
     for stages in shown.values():
-        shadow = stages.get("shadow")
-        levels_of = view_levels(shadow, p.likelihood) if shadow is not None else None
-        writer.show_view(
-            StagedView(
-                stages.get("sub_aperture"),
-                shadow,
-                levels_of,
-                stages.get("likelihood"),
-                stages.get("mask"),
-            )
-        )
-    if other.stamps:
-        result.other_grid = other.grid()
-    if result.target is not None:
-        for kept in masks.values():  # silhouettes that came without the views that they are of
-            mask = kept.view()
-            sides = silhouette_sides(levels_of_mask(mask), mask, result.target.position_m)
-            result.sides += [sides] if sides is not None else []
-    if result.mesh is not None:
-        result.dimensions = measure_object(result.grid, result.mesh, result.sides)
-    open_hollows(result)
+        if stages:
+            writer.show_view(ProcessedView(result.target, parameters, **stages))
 
 
 def node_table(replayed: ReplayResult) -> dict[str, Any]:
@@ -178,11 +131,10 @@ def unplaced(replayed: ReplayResult) -> list[str]:
     ]
 
 
-def is_snapshot(reader: BagReader, topic: str) -> bool:
+def is_snapshot(reader: BagReader, name: str) -> bool:
     """Say whether a recorded topic is a result that was published again and again as it grew."""
-    relative = topic.removeprefix(f"{reader.namespace}/")
-    stream = relative.partition("/")[0]
-    return stream in ("voxel_grid", "voxel_views", "voxels", "mesh", "multilook", "color_by_aspect")
+    relative = split_prefix(name.removeprefix(f"{reader.namespace}/"))[1]
+    return relative in RESULT_TOPICS or relative.partition("/")[0] in ("multilook", "color_by_aspect")
 
 
 def copy_recording(recording: Path, target: Any) -> None:

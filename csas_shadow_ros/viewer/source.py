@@ -23,6 +23,7 @@ from msg_adapters.topics import STREAMS, VIEW_STREAMS
 from msg_adapters.track import track_from_msg
 
 from ..bags import BagReader, iterate_pairs, read_run
+from ..bags.index import BagIndex
 from ..bags.run import checked_messages
 from ..core.carving import Carver
 from ..core.errors import BagError, CsasError
@@ -34,7 +35,6 @@ from ..core.subaperture import SubApertures
 from ..core.threshold import thresholded
 from ..core.volume import Volume, VoxelGrid
 from . import codes
-from .index import BagIndex
 from .store import Entry, Spool, ViewerError, ViewStore
 
 log = logging.getLogger(__name__)

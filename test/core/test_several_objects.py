@@ -10,13 +10,14 @@ import pytest
 
 from csas_shadow_ros.core import pipeline
 from csas_shadow_ros.core.errors import ParameterError
-from csas_shadow_ros.core.objects import connected_pieces, further_targets, overlap_share
 from csas_shadow_ros.core.parameters import (
     CarvingParameters,
     PipelineParameters,
     SubApertureParameters,
     TargetParameters,
 )
+from csas_shadow_ros.core.search.decision import decide
+from csas_shadow_ros.core.shape.pieces import connected_pieces, overlap_share
 from csas_shadow_ros.core.target import Search, stands_on_seabed
 from csas_shadow_ros.core.volume import Target, Volume, VoxelGrid
 from csas_shadow_ros.simulation import simulate
@@ -177,11 +178,12 @@ def test_what_hangs_higher_than_it_is_high_does_not_stand_on_the_seabed():
 def test_phantoms_take_no_place_of_a_body_and_bodies_beyond_the_most_are_named():
     bodies = [Target((float(k), 0.0), (1.0, 1.0, 0.5), 9.0 - k, stands=k != 1) for k in range(5)]
     search = Search(tuple(bodies), Volume((0.0, 0.0, 0.0), 1.0, (1, 1, 1)), np.zeros((1, 1, 1), np.float32))
-    targets, left_out = further_targets(search, 3)
-    assert targets == [bodies[2], bodies[3]]
-    assert [left.position_m[0] for left in left_out] == [1.0, 4.0]
-    assert "phantom" in left_out[0].reason
-    assert "no more than 3" in left_out[1].reason
+    decision = decide(search, TargetParameters(), max_objects=3)
+    assert decision.target == bodies[0]
+    assert decision.others == (bodies[2], bodies[3])
+    assert [left.position_m[0] for left in decision.left_out] == [1.0, 4.0]
+    assert "phantom" in decision.left_out[0].reason
+    assert "no more than 3" in decision.left_out[1].reason
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.03, -0.04])

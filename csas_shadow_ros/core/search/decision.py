@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 
 from ..errors import NoTargetError, ViewError
 from ..geometry import TWO_PI, CoherentImage, Track, View, fit_target_to_focus, wrap_angle
-from ..parameters import PipelineParameters, ShadowParameters, TargetParameters
+from ..parameters import (
+    MAX_OBJECTS,
+    PipelineParameters,
+    ShadowParameters,
+    TargetParameters,
+)
 from ..shadow import enhance
 from ..shape.result import LeftOut
 from ..subaperture import Spectrum
 from ..target import Search, SignEvidence, search_image, search_views, spectrum_sign_evidence
 from ..volume import Target
 
-#: Bodies carved if nothing else is asked for, the target among them. Each further one takes about half
-#: of the target's time.
-MAX_OBJECTS = 4
-#: More than this are refused: their views would not fit into memory.
-MOST_OBJECTS = 64
 #: How many views from all round look for the target: one every 10°, as the search in an image makes them.
 _SEARCH_VIEWS = 36
 PHANTOM = "a phantom: shadows of other bodies cross over it, and it does not reach down to the seabed"

@@ -10,10 +10,9 @@ from mcap.records import ChunkIndex
 from msg_adapters.messages import stamp_to_ns
 from msg_adapters.topics import absolute_name, stream
 
-from ..bags import BagReader
-from ..bags.bag import BagMessage
-from ..bags.mcap_file import McapFile
 from ..core.errors import BagError
+from .bag import BagMessage, BagReader
+from .mcap_file import McapFile
 
 
 class BagIndex:

@@ -1,0 +1,62 @@
+"""Which run a message belongs to: the one whose track covers its stamp."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from csas_shadow_ros.core.geometry.runs import TrackBook
+from msg_adapters import track_piece_from_msg
+
+from .. import qos
+
+if TYPE_CHECKING:
+    from ..base import CsasNode
+
+#: So long a message waits for a track that covers its stamp (s): a vehicle publishes its track at 1 Hz or
+#: faster, and ten of these may be lost. At half of it a slow track costs views; at double nothing but memory.
+HOLD_S = 10.0
+
+
+class RunFollower:
+    """Follows topic `track` and tells runs apart by it.
+
+    Parameters
+    ----------
+    node : CsasNode
+        The node.
+    on_track : callable, optional
+        Called with the run that a Path belongs to, and the names that have changed since.
+    """
+
+    def __init__(
+        self, node: CsasNode, on_track: Callable[[int, dict[int, int]], None] | None = None
+    ) -> None:
+        self.book = TrackBook()
+        self._on_track = on_track
+        node.subscribe_latched("track", self._take, profile=qos.TRACK)
+
+    def _take(self, msg: Any) -> None:
+        name = self.book.add(track_piece_from_msg(msg))
+        if self._on_track is not None:
+            self._on_track(name, dict(self.book.renamed))
+
+    def run_of(self, stamp_ns: int) -> int | None:
+        """Return the name of the run whose track covers a stamp; None if none does."""
+        return self.book.run_of(stamp_ns)
+
+    def hold(self, stamp_ns: int) -> tuple[str, float]:
+        """Say why a message of a stamp has to wait, and for how long at most (s); empty if it need not.
+
+        Where there is no track at all, all that comes is of one run.
+        """
+        if not self.book.names or self.run_of(stamp_ns) is not None:
+            return "", 0.0
+        return f"no track covers its stamp ({self.book.describe()})", HOLD_S
+
+    def image_hold(self, stamp_ns: int) -> tuple[str, float]:
+        """Say the same of an image, which has to wait for a track for as long as there is none at all."""
+        if not self.book.names:
+            return "there is no track", math.inf
+        return self.hold(stamp_ns)
