@@ -24,6 +24,7 @@ from .mesh import mesh_from_msg, mesh_to_msg
 from .messages import MessageFactory
 from .objects import objects_to_msg
 from .pairs import voxel_grid_from_msgs, voxel_grid_to_msgs
+from .search import decision_from_msg
 from .topics import GRID_TOPICS, OTHER_METHOD, prefixed
 from .voxels import voxels_from_msg, voxels_to_msg
 
@@ -151,6 +152,8 @@ def result_from_msgs(messages: Mapping[str, Any]) -> Result:
         arc_rad=told.arc_rad,
         left_out=list(told.left_out),
     )
+    if "search" in messages:
+        result.decision = decision_from_msg(messages["search"]).decision
     if "evidence" in messages:
         result.evidence = evidence_from_msg(messages["evidence"])
     if told.main is not None:

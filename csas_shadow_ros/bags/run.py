@@ -197,7 +197,7 @@ class Run:
         return f"{self.path}: {lack}{found}{more}"
 
     def decision(self) -> Decision | None:
-        """Return what the views of the bag were made for, as its topic `search` or `target` tells; None if neither."""
+        """Return what the bag's views were made for, as topic `search` or `target` tells; None if neither."""
         # Late: it needs the method, which readers of messages need not load.
         from csas_shadow_ros.core.search.decision import Decision
         from csas_shadow_ros.core.volume import Target

@@ -344,6 +344,7 @@ class Reconstruction:
             stamp_ns=max(self.stamps, default=0),
             final=final,
             target=self.decision.target,
+            decision=self.decision,
             sign=self.decision.sign,
             composites=self.composites,
             views_used=len(self.stamps),

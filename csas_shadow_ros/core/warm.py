@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +23,9 @@ from .geometry import (
     view_ground_to_pixel,
 )
 from .parameters import CarvingParameters, SubApertureParameters
+
+if TYPE_CHECKING:
+    from .pipeline import ProcessedView
 
 # Stages are imported where they are warmed: no process loads those of another.
 
@@ -54,27 +58,31 @@ def _shadow_view() -> View:
     return replace(view, pixels=np.abs(view.pixels).astype(np.float32))
 
 
+def _sample(**given: View) -> ProcessedView:
+    """Begin with a stage of the sample view."""
+    from .parameters import PipelineParameters
+    from .pipeline import ProcessedView
+    from .volume import Target
+
+    return ProcessedView(Target(_TARGET_M, (0.6, 0.6, 0.3)), PipelineParameters(), **given)
+
+
 def warm_enhancement() -> None:
     """Enhance a sample view."""
-    from .shadow import enhance
-
-    enhance(sample_view(), _TARGET_M)
+    _sample(sub_aperture=sample_view()).require("shadow")
 
 
 def warm_likelihood() -> None:
     """Take a sample view through levels, likelihood and segmentation."""
-    from .likelihood import outside_likelihood, view_levels
-    from .segmentation import segment_shadow
-
-    shadow = _shadow_view()
-    levels = view_levels(shadow)
-    outside_likelihood(shadow, None, levels)
-    segment_shadow(shadow, _TARGET_M, None, levels, reach_m=0.3)
+    made = _sample(shadow=_shadow_view())
+    for part in ("levels", "likelihood", "mask"):
+        made.require(part)
 
 
 def warm_carving(parameters: CarvingParameters | None = None) -> None:
     """Carve a few voxels with a sample view by a method, and look at them as at the end of a run."""
     from .carving import Carver
+    from .hollows import matter_of
     from .mesh import measure, mesh_from_grid
     from .volume import Volume
 
@@ -91,7 +99,11 @@ def warm_carving(parameters: CarvingParameters | None = None) -> None:
     grid = carver.grid()
     occupied = np.zeros(grid.volume.shape, bool)
     occupied[:3, 4:8, 4:8] = True
-    measure(mesh_from_grid(replace(grid, occupied=occupied, likelihood=np.where(occupied, 0.0, 1.0))))
+    grid = replace(grid, occupied=occupied, likelihood=np.where(occupied, 0.0, 1.0).astype(np.float32))
+    measure(mesh_from_grid(grid))
+    made = _sample(shadow=shadow)
+    matter_of(grid, [made.require("look")])
+    getattr(made, "sides")  # noqa: B009  (made when it is asked for)
 
 
 def warm_sub_apertures() -> None:

@@ -182,9 +182,9 @@ class CsasNode(LifecycleNode):
 
     # Making entities that live from configure to cleanup
 
-    def publisher(self, topic: str, profile: Any, type_name: str | None = None) -> Publisher:
+    def publisher(self, topic: str, profile: Any) -> Publisher:
         """Make a publisher of a topic of the contract."""
-        made = self.create_publisher(self.messages.cls(type_name or topic_of(topic).type_name), topic, profile)
+        made = self.create_publisher(self.messages.cls(topic_of(topic).type_name), topic, profile)
         self._owned.append((self.destroy_publisher, made))
         return made
 
@@ -219,10 +219,14 @@ class CsasNode(LifecycleNode):
         self.subscribe(topic, profile, callback, raw=raw)
         if not self._unlatched:
             # One timer for all topics: a recorder follows dozens.
-            self.every(_DURABILITY_S, lambda: [one.look() for one in self._unlatched] and None)
+            self.every(_DURABILITY_S, self._look_for_unlatched)
         self._unlatched.append(
             Unlatched(self, topic, lambda: self.subscribe(topic, qos.UNLATCHED, callback, raw=raw))
         )
+
+    def _look_for_unlatched(self) -> None:
+        for one in self._unlatched:
+            one.look()
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call back periodically while the node is configured."""

@@ -33,9 +33,9 @@ from msg_adapters import (
     Pairer,
     coherent_image_from_msgs,
     ground_picture_from_msgs,
+    measurements_from_msg,
     progress_to_msg,
     target_from_msg,
-    track_from_msg,
     view_from_msgs,
     voxel_grid_from_msgs,
 )
@@ -44,6 +44,7 @@ from msg_adapters.topics import stream as stream_of
 from . import qos
 from .base import INTEGRATED, CsasNode, Inlet, run_node
 from .flow import place_of
+from .runtime.runs import RunFollower
 
 #: Messages that wait to be shown; newer ones are dropped, and caught up with at the end of the run.
 _BACKLOG = 32
@@ -91,6 +92,9 @@ class ViewerNode(CsasNode):
         self._queue: queue.Queue[tuple[str, Any, Any]] = queue.Queue(_BACKLOG)
         self._volumes: dict[str, Any] = {}
         self._track: Any = None
+        #: The run that is shown.
+        self._run_ns: int | None = None
+        self._runs = RunFollower(self, self._on_track)
         self._image: dict[str, bytes] = {}
         self._finished = False
         self._said_s = 0.0
@@ -98,6 +102,7 @@ class ViewerNode(CsasNode):
         self._tries: dict[tuple[str, int], int] = {}
         self._since_s = time.monotonic()
         self._shaped = threading.Event()
+        self._measured = False
         self._stopping = threading.Event()
         self._worker = threading.Thread(target=self._work, name="viewer-worker", daemon=True)
         self._worker.start()
@@ -105,8 +110,8 @@ class ViewerNode(CsasNode):
             self._pair(name, latched=False)
         for name in _GROWING:
             self._pair(name, latched=True)
-        self.subscribe_latched("track", self._take_track)
         self.subscribe_latched("target", self._take_target)
+        self.subscribe_latched("measurements", self._take_measurements)
         for topic in ("image", "camera_info"):
             self.subscribe_latched(topic, partial(self._take_image, topic), raw=True)
         self.follow_sources()
@@ -156,20 +161,36 @@ class ViewerNode(CsasNode):
             else:
                 self.subscribe(topic, qos.VIEWS, callback)
 
-    def _take_track(self, msg: Any) -> None:
-        track = track_from_msg(msg)
-        before, self._track = self._track, track
-        if before is not None:
-            # A track that grows goes on as it was; another one is another run.
-            n = min(len(before), len(track))
-            if (before.stamps_ns[:n] != track.stamps_ns[:n]).any():
-                self.store.reset()
-                self._tries.clear()
-        self.store.put_track(track)
+    def _on_track(self, name: int, renamed: dict[int, int]) -> None:
+        if self._run_ns is not None:
+            self._run_ns = renamed.get(self._run_ns, self._run_ns)
+        if self._run_ns is None or name == self._run_ns:
+            self._show_track(name)
+
+    def _show_track(self, name: int) -> None:
+        self._track = self._runs.book.track(name)
+        self.store.put_track(self._track)
         self._offer_reduced()
+
+    def _enter_run(self, stamp: int) -> None:
+        """Show another run from its first view on: until then the one before stays."""
+        run_ns = self._runs.run_of(stamp)
+        if run_ns is None or run_ns == self._run_ns:
+            return
+        if self._run_ns is not None:
+            self.store.reset(keep=("target", "reduced"))
+            self._tries.clear()
+            self._measured = False
+        self._run_ns = run_ns
+        self._show_track(run_ns)
 
     def _take_target(self, msg: Any) -> None:
         self.store.put_part("target", box_json(target_from_msg(msg)))
+
+    def _take_measurements(self, msg: Any) -> None:
+        told = measurements_from_msg(msg)
+        self._measured = True
+        self.store.put_dimensions(told.objects[0].dimensions if told.objects else None)
 
     def _take_image(self, topic: str, cdr: bytes) -> None:
         self._image[topic] = cdr
@@ -204,6 +225,7 @@ class ViewerNode(CsasNode):
     def _show(self, name: str, image: Any, info: Any) -> None:
         if name in VIEW_STREAMS:
             entry = spooled(self._spool, name, view_from_msgs(image, info, name))
+            self._enter_run(entry.info.stamp_ns)
             self.store.put_view(name, entry)
             self._shaped.clear()
             inlet = next((i for i in self.inlets if i.stream == name), None)
@@ -231,7 +253,8 @@ class ViewerNode(CsasNode):
             self._shape.add(name, entry)
         if len(left) <= _BATCH:
             self._shaped.set()
-            self._shape.publish(measure=self._finished)
+            # Who carves says how large it is; of another's grid nobody does.
+            self._shape.publish(measure=self._finished and not self._measured)
 
     # Catching up, once nobody else needs the source
 

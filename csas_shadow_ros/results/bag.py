@@ -7,25 +7,28 @@ from pathlib import Path
 from typing import Any
 
 from msg_adapters.camera_info import GroundInfo
-from msg_adapters.mesh import mesh_to_msg
 from msg_adapters.messages import RosbagsMessages
 from msg_adapters.pairs import (
     coherent_image_to_msgs,
     ground_picture_to_msgs,
     view_to_msgs,
-    voxel_grid_to_msgs,
 )
+from msg_adapters.result import result_to_msgs
+from msg_adapters.search import decision_to_msg
 from msg_adapters.target import TargetBox, target_to_msg
-from msg_adapters.topics import NAMESPACE, STREAMS, TOPICS, absolute_name
+from msg_adapters.topics import NAMESPACE, RESULT_TOPICS, STREAMS, TOPICS, absolute_name, topic
 from msg_adapters.track import track_to_msg
-from msg_adapters.voxels import voxels_to_msg
 
 from ..bags import BagReader, BagWriter
 from ..core.geometry import Acoustics, CoherentImage, Track, View
 from ..core.shape.result import Result
 
-_LATCHED = ("image", "camera_info", "track", "target", "mesh", "voxels")
-_LATCHED_STREAMS = ("multilook", "color_by_aspect", "voxel_grid", "voxel_views")
+#: Topics that a result's bag always has, whatever the run found.
+_ALWAYS = (
+    *("image", "camera_info", "track", "search", "target"),
+    *(f"{s}/{part}" for s in ("multilook", "color_by_aspect") for part in ("image", "camera_info")),
+    *RESULT_TOPICS,
+)
 
 
 class ResultBag:
@@ -49,8 +52,7 @@ class ResultBag:
         self._last_ns = 0
         self._adopted = False
         self._file: Path | None = None
-        names = [*_LATCHED, *(f"{s}/{kind}" for s in _LATCHED_STREAMS for kind in ("image", "camera_info"))]
-        for name in names:
+        for name in _ALWAYS:
             self._writer.add_topic(absolute_name(name), TOPICS[name].type_name, depth=1)
 
     def _write(self, relative: str, message: Any, when_ns: int | None = None) -> None:
@@ -147,18 +149,16 @@ class ResultBag:
                 picture, camera = ground_picture_to_msgs(factory, pixels, info, name)
                 self._write(STREAMS[name].info_topic, camera)
                 self._write(STREAMS[name].image_topic, picture)
-        grid = result.grid
-        if grid is not None:
-            picture, camera = voxel_grid_to_msgs(factory, grid.volume, grid.likelihood, when)
-            self._write("voxel_grid/camera_info", camera)
-            self._write("voxel_grid/image", picture)
-            picture, camera = voxel_grid_to_msgs(factory, grid.volume, grid.views, when, "voxel_views")
-            self._write("voxel_views/camera_info", camera)
-            self._write("voxel_views/image", picture)
-            self._write("voxels", voxels_to_msg(factory, grid, when))
-        box = None if grid is None else TargetBox.of(grid.volume)
+        if result.decision is not None:
+            self._write("search", decision_to_msg(factory, result.decision, when, result.run_ns, when))
+        box = None
+        if result.target is not None:
+            x, y = result.target.position_m
+            box = TargetBox((x, y, result.target.size_m[2] / 2.0), result.target.size_m)
         self._write("target", target_to_msg(factory, box, when))
-        self._write("mesh", mesh_to_msg(factory, result.mesh, when))
+        for name, message in result_to_msgs(factory, result, stamp_ns=when):
+            self._writer.add_topic(absolute_name(name), topic(name).type_name, depth=1)
+            self._write(name, message, when)
 
     def abandon(self) -> None:
         """Close what has been written; the folder is not going to be kept."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from msg_adapters.camera_info import view_info_from_msg
 from msg_adapters.image import image_from_msg
+from msg_adapters.measurements import measurements_from_msg
 from msg_adapters.pairs import ground_picture_from_msgs, view_from_msgs, voxel_grid_from_msgs
 from msg_adapters.target import TargetBox, target_from_msg
 from msg_adapters.topics import STREAMS, VIEW_STREAMS
@@ -25,15 +26,15 @@ from msg_adapters.track import track_from_msg
 from ..bags import BagReader, iterate_pairs, read_run
 from ..bags.index import BagIndex
 from ..bags.run import checked_messages
-from ..core.carving import Carver
 from ..core.errors import BagError, CsasError
 from ..core.geometry import CoherentImage, Track, View
-from ..core.measurement import SilhouetteSides, levels_of_mask, measure_object, silhouette_sides
-from ..core.mesh import mesh_from_grid
 from ..core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
+from ..core.pipeline import ProcessedView
+from ..core.reconstruction import Reconstruction
+from ..core.search.decision import Decision
 from ..core.subaperture import SubApertures
 from ..core.threshold import thresholded
-from ..core.volume import Volume, VoxelGrid
+from ..core.volume import Target, Volume, VoxelGrid
 from . import codes
 from .store import Entry, Spool, ViewerError, ViewStore
 
@@ -86,14 +87,14 @@ class Reduced:
 
 
 class Shape:
-    """The other method's grid, and dimensions from the silhouettes, as views come in."""
+    """The other method's grid, and dimensions where nobody has published them, as views come in."""
 
     def __init__(self, store: ViewStore, parameters: CarvingParameters) -> None:
         self._store = store
         self.parameters = parameters
-        self._sides: dict[int, SilhouetteSides] = {}
         self._taken: set[tuple[str, int]] = set()
-        self._other: Carver | None = None
+        self._volume: Volume | None = None
+        self._made: Reconstruction | None = None
 
     @property
     def other_stream(self) -> str:
@@ -114,42 +115,41 @@ class Shape:
                 if (name, entry.info.stamp_ns) not in self._taken
             ]
 
-    def _on(self, volume: Volume) -> Carver:
-        if self._other is None or self._other.volume != volume:
-            self._other, self._sides, self._taken = Carver(volume, self.parameters.other()), {}, set()
-        return self._other
+    def _on(self, volume: Volume) -> Reconstruction:
+        if self._made is None or self._volume != volume:
+            x, y, _ = volume.centre_m
+            carving = replace(self.parameters, voxel_size_m=volume.voxel_size_m)
+            decision = Decision(Target((x, y), volume.size_m))
+            self._made = Reconstruction(decision, PipelineParameters(carving=carving), compose=False)
+            self._volume, self._taken = volume, set()
+        return self._made
 
     def add(self, name: str, entry: Entry) -> None:
         """Take one likelihood or mask."""
         main = self._store.grids.get("main")
         if main is None:
             return
-        volume = main.volume
-        other = self._on(volume)
+        made = self._on(main.volume)
         self._taken.add((name, entry.info.stamp_ns))
         pixels: NDArray[Any] = entry.load()
         if name == "likelihood":
             pixels = codes.likelihood_of(pixels)
         view = View(entry.info, pixels)
         try:
-            if name == self.other_stream:
-                other.integrate(view)
-            if name == "shadow_mask":
-                x, y, _ = volume.centre_m
-                side = silhouette_sides(levels_of_mask(view), view, (x, y))
-                if side is not None:
-                    self._sides[entry.info.stamp_ns] = side
+            one = ProcessedView(made.decision.target, made.parameters, **{name: view})
+            made.add(one, parts=(name.removeprefix("shadow_"),))
         except CsasError as error:
             log.info("%s: %s", name, error)  # the node that made it, or the report, names it too
 
     def publish(self, *, measure: bool) -> None:
         """Give the store what there is now."""
-        if self._other is not None and self._other.stamps:
-            self._store.put_grid("other", self._other.grid(), self.parameters.min_views_fraction)
-        main = self._store.grids.get("main")
-        if measure and main is not None and main.occupied.any():
-            found = measure_object(main, mesh_from_grid(main), list(self._sides.values()))
-            self._store.put_dimensions(found)
+        if self._made is None:
+            return
+        other = self._made.bodies[0].other
+        if other is not None and other.stamps:
+            self._store.put_grid("other", other.grid(), self.parameters.min_views_fraction)
+        if measure and self._made.stamps:
+            self._store.put_dimensions(self._made.result().dimensions)
 
 
 def grid_of(
@@ -312,7 +312,7 @@ class PathSource:
                     self._register(index, name)
             self._composites()
             shape = Shape(self.store, replace(self._parameters.carving, threshold=0.0))
-            measure = not self._report
+            measure = not self._report and not self._measured()
             for name in ("likelihood", "shadow_mask"):
                 if measure or name == shape.other_stream:
                     for entry in list(self.store.sets[name].values()):
@@ -326,6 +326,19 @@ class PathSource:
             for line in self._reader.problems:
                 self._problem(line)
             self.done.set()
+
+    def _measured(self) -> bool:
+        """Show what the bag says of the target's dimensions; False if it says nothing."""
+        said = False
+        for _, message, _ in checked_messages(self._reader, "measurements", self._problem):
+            try:
+                objects = measurements_from_msg(message).objects
+            except CsasError as error:
+                self._problem(f"measurements: {error}")
+                continue
+            said = True
+            self.store.put_dimensions(objects[0].dimensions if objects else None)
+        return said
 
     def _sequential(self, name: str) -> Any:
         for pair in iterate_pairs(self._reader, name, self._problem):

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ..composites import Composites
     from ..hollows import EchoLook
     from ..measurement import SilhouetteSides
+    from ..search.decision import Decision
     from ..target import SignEvidence
 
 #: What a run can find.
@@ -122,6 +123,8 @@ class Result:
         How far that can be trusted, and why not further.
     target : Target or None
         The volume that was carved; None: nothing was found to carve.
+    decision : Decision or None
+        Everything that was carved, the target among it.
     sign : SignEvidence or None
         Whether the shadows fit the spectrum sign; None if it was not checked.
     grid, other_grid : VoxelGrid or None
@@ -161,6 +164,7 @@ class Result:
     verdict: str = "no object"
     quality: Quality = Quality()
     target: Target | None = None
+    decision: Decision | None = None
     sign: SignEvidence | None = None
     grid: VoxelGrid | None = None
     other_grid: VoxelGrid | None = None
