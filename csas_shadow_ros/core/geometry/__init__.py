@@ -1,0 +1,60 @@
+"""Geometry: ground grids, the track, the shadow camera and the view frame.
+
+Frames (SI, radians). The scene frame is x east, y north, z up, z = 0 on the seabed. The aspect θ is
+the azimuth of the sonar seen from the scene's origin, counter-clockwise from +x, and û(θ) = (cos θ,
+sin θ) points to the sonar. A view of aspect θ has cross-range e_c = (sin θ, -cos θ) along its
+columns and down-range e_r = -û(θ) along its rows: the sonar is above the picture and shadows fall
+downwards. See ``docs/conventions.md``.
+"""
+
+from __future__ import annotations
+
+from .camera import (
+    ShadowCamera,
+    shadow_matrix,
+    view_ground_to_pixel,
+)
+from .frames import (
+    TWO_PI,
+    Acoustics,
+    FloatArray,
+    GroundGrid,
+    aspects_of_step,
+    cross_range_axis,
+    down_range_axis,
+    unit_to_sonar,
+    wrap_angle,
+)
+from .track import (
+    AspectGap,
+    Track,
+)
+from .views import (
+    CoherentImage,
+    View,
+    ViewInfo,
+    fit_target_to_focus,
+    looks_at,
+)
+
+__all__ = [
+    "TWO_PI",
+    "Acoustics",
+    "AspectGap",
+    "CoherentImage",
+    "FloatArray",
+    "GroundGrid",
+    "ShadowCamera",
+    "Track",
+    "View",
+    "ViewInfo",
+    "aspects_of_step",
+    "cross_range_axis",
+    "down_range_axis",
+    "fit_target_to_focus",
+    "looks_at",
+    "shadow_matrix",
+    "unit_to_sonar",
+    "view_ground_to_pixel",
+    "wrap_angle",
+]

@@ -1,0 +1,144 @@
+"""Pictures with their geometry: views and the full-circle image."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import GeometryError
+from .camera import ShadowCamera
+from .frames import TWO_PI, Acoustics, FloatArray, GroundGrid, down_range_axis
+
+
+@dataclass(frozen=True)
+class ViewInfo:
+    """Everything about a view except its pixels: what its ``CameraInfo`` carries.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        When the sonar was at that aspect; identifies the view through the whole graph.
+    camera : ShadowCamera
+        Geometry.
+    acoustics : Acoustics
+        Band, sound speed, spectrum sign.
+    aspect_rad : float
+        θ₀, centre of the aperture.
+    aperture_rad : float
+        Full width of the aperture.
+    carrier_rad_m : (float, float)
+        Wavenumber (kx, ky), scene axes, that was divided out; (0, 0) where not demodulated.
+    focus_range_m : float
+        r₀ = e_r · target; NaN before enhancement.
+    """
+
+    stamp_ns: int
+    camera: ShadowCamera
+    acoustics: Acoustics
+    aspect_rad: float
+    aperture_rad: float
+    carrier_rad_m: tuple[float, float] = (0.0, 0.0)
+    focus_range_m: float = math.nan
+
+    @property
+    def resolution_m(self) -> tuple[float, float]:
+        """Size of a resolution cell on the ground, (down-range, cross-range).
+
+        2π over the wedge's extent: K(f_c + B/2) - K(f_c - B/2) down-range, 2 K(f_c) sin(w/2) cross-range.
+        """
+        low, mid, high = self.acoustics.ground_band(self.camera.grazing_rad)
+        cross = 2.0 * mid * math.sin(min(self.aperture_rad, math.pi) / 2.0)
+        return TWO_PI / (high - low), TWO_PI / cross if cross > 0 else math.inf
+
+    def down_range_of_rows(self) -> FloatArray:
+        """Down-range e_r · p (m) of each row's centre, shape (rows,)."""
+        e_r = down_range_axis(self.aspect_rad)
+        to_ground = self.camera.pixel_to_ground
+        start = to_ground[:2] @ np.array([(self.camera.cols - 1) / 2.0, 0.0, 1.0])
+        rows = np.arange(self.camera.rows, dtype=np.float64)
+        return float(e_r @ start) + rows * float(e_r @ to_ground[:2, 1])
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One picture of the scene in its view frame.
+
+    Parameters
+    ----------
+    info : ViewInfo
+        Geometry and band.
+    pixels : ndarray, shape (rows, cols)
+        complex64 (sub-aperture), float32 (shadow amplitude or likelihood) or uint8 (mask). NaN where
+        the view knows nothing.
+    """
+
+    info: ViewInfo
+    pixels: NDArray[Any]
+
+    def __post_init__(self) -> None:
+        if self.pixels.shape != self.info.camera.shape:
+            raise GeometryError(
+                f"view has {self.pixels.shape} pixels; its camera says {self.info.camera.shape} (rows, cols)"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class CoherentImage:
+    """A full-circle coherent complex image on the ground plane, north up.
+
+    Parameters
+    ----------
+    pixels : ndarray of complex64 or complex128, shape (rows, cols)
+        The image.
+    grid : GroundGrid
+        Its lattice.
+    acoustics : Acoustics
+        Its band.
+    stamp_ns : int
+        Stamp of the message that it came in.
+    """
+
+    pixels: NDArray[Any]
+    grid: GroundGrid
+    acoustics: Acoustics
+    stamp_ns: int = 0
+
+    def __post_init__(self) -> None:
+        if self.pixels.shape != self.grid.shape:
+            raise GeometryError(
+                f"image has {self.pixels.shape} pixels; its grid says {self.grid.shape} (rows, cols)"
+            )
+
+
+def looks_at(info: ViewInfo, target_m: tuple[float, float]) -> bool:
+    """Say whether a view's focus range is that of a target, r₀ = e_r · target; without one it may be."""
+    r0 = float(down_range_axis(info.aspect_rad) @ np.asarray(target_m, dtype=np.float64))
+    return not math.isfinite(info.focus_range_m) or abs(info.focus_range_m - r0) < 1e-6
+
+
+def fit_target_to_focus(infos: Sequence[ViewInfo]) -> tuple[float, float]:
+    """Find the ground point whose down-range in every view is that view's focus range.
+
+    r₀(θ) = e_r(θ) · target is one line a view; two aspects or more give the point (least squares).
+
+    Raises
+    ------
+    GeometryError
+        If fewer than two views are focused, or their aspects are all alike.
+    """
+    focused = [i for i in infos if math.isfinite(i.focus_range_m)]
+    if len(focused) < 2:
+        raise GeometryError(
+            f"{len(focused)} views have a focus range; expected at least 2 to locate the target"
+        )
+    axes = np.array([down_range_axis(i.aspect_rad) for i in focused])
+    ranges = np.array([i.focus_range_m for i in focused])
+    if np.linalg.svd(axes, compute_uv=False)[-1] < 1e-3 * math.sqrt(len(focused)):
+        raise GeometryError("the focused views all look the same way; expected different aspects")
+    point, *_ = np.linalg.lstsq(axes, ranges, rcond=None)
+    return float(point[0]), float(point[1])
