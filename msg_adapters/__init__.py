@@ -55,7 +55,7 @@ from .progress import (
 )
 from .target import TargetBox, target_from_msg, target_may_move, target_to_msg
 from .topics import NAMESPACE, STREAMS, TOPICS, VIEW_STREAMS, ImageStream, Topic, absolute_name
-from .track import track_from_msg, track_to_msg
+from .track import track_from_msg, track_piece_from_msg, track_to_msg
 from .voxels import Voxels, voxels_from_msg, voxels_to_msg
 
 __all__ = [
@@ -108,6 +108,7 @@ __all__ = [
     "target_may_move",
     "target_to_msg",
     "track_from_msg",
+    "track_piece_from_msg",
     "track_to_msg",
     "type_name_of",
     "view_from_msgs",
