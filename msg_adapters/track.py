@@ -6,14 +6,20 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from csas_shadow_ros.core.errors import AdapterError, CsasError
-from csas_shadow_ros.core.geometry import Track
+from csas_shadow_ros.core.geometry import Track, TrackPiece
 
 from .messages import SCENE_FRAME, MessageFactory, check_frame, check_type, make_header, point, stamp_to_ns
 from .topics import PATH
 
 DEFAULT_MAX_GAP_RAD = math.radians(3.0)
+#: A receiver that loses its fix for a moment is no reason to refuse a run: 7 of 720 poses, 3.5° of the
+#: circle, hardly more than the gap that is bridged (3°). At half of it 3 poses; at double an arc is lost.
+MAX_BAD_POSES = 0.01
+#: So many of them are named one by one.
+MAX_NOTES = 3
 
 
 def track_to_msg(factory: MessageFactory, track: Track) -> Any:
@@ -51,6 +57,77 @@ def track_from_msg(msg: Any, max_gap_rad: float = DEFAULT_MAX_GAP_RAD) -> Track:
     AdapterError
         If a frame, a stamp or the positions are not usable as a track; the error names the pose.
     """
+    stamps, positions = _poses(msg)
+    try:
+        return Track(stamps, positions, max_gap_rad=max_gap_rad)
+    except CsasError as error:
+        raise AdapterError(f"track.poses: {error}") from error
+
+
+def track_piece_from_msg(msg: Any) -> TrackPiece:
+    """Read a Path as poses of a run, whole or in part; orientations are not used.
+
+    Parameters
+    ----------
+    msg : nav_msgs/Path
+        Of either message world; every pose stamped, in `csas_scene`.
+
+    Returns
+    -------
+    TrackPiece
+        Without the poses that cannot be used (not finite, not above the seabed, over the scene's origin,
+        stamped out of order), if they are at most 1 % of all, or one. Its notes name them.
+
+    Raises
+    ------
+    AdapterError
+        If a frame or a stamp is not usable, there is no pose, or more poses cannot be used.
+    """
+    stamps, positions = _poses(msg)
+    n = len(stamps)
+    if not n:
+        raise AdapterError("track.poses: track has 0 poses; expected at least 1")
+    header_ns = stamp_to_ns(msg.header.stamp, "track.header.stamp")
+    bad: dict[int, str] = {}
+    for i in np.flatnonzero(~np.isfinite(positions).all(axis=1)).tolist():
+        bad[i] = f"track pose {i} is {positions[i].tolist()}; expected finite metres"
+    low = np.flatnonzero(positions[:, 2] <= 0.0)
+    for i in low.tolist():
+        bad.setdefault(
+            i, f"track pose {i} is at z = {positions[i, 2]:g} m; expected above the seabed (z > 0)"
+        )
+    for i in np.flatnonzero(np.hypot(positions[:, 0], positions[:, 1]) < 1e-9).tolist():
+        bad.setdefault(i, f"track pose {i} is over the scene's origin: no aspect there")
+    good = [i for i in range(n) if i not in bad]
+    times = stamps.tolist()
+    last = -1
+    for k, i in enumerate(good):
+        after = times[good[k + 1]] if k + 1 < len(good) else None
+        if last >= 0 and times[i] <= times[last]:
+            bad[i] = f"pose {i} ({times[i]} ns) is not after pose {last} ({times[last]} ns)"
+        elif after is not None and after < times[i] and (last < 0 or after > times[last]):
+            # It is the one before that is out of order: all later ones would be, too.
+            bad[i] = f"pose {i} ({times[i]} ns) is after pose {good[k + 1]} ({after} ns)"
+        else:
+            last = i
+            continue
+        bad[i] = f"track stamps are out of order: {bad[i]}"
+    if len(bad) > max(1, int(MAX_BAD_POSES * n)) or len(bad) == n:
+        first = min(bad)
+        hint = ""
+        if len(low) == n:
+            hint = (
+                "; all poses are: is z positive downwards, as in NED axes? z is the height above the seabed"
+            )
+        raise AdapterError(f"track.poses: {bad[first]} ({len(bad)} of {n} poses cannot be used){hint}")
+    kept = np.array([i for i in range(n) if i not in bad], dtype=np.int64)
+    notes = tuple(f"{bad[i]}: left out" for i in sorted(bad)[:MAX_NOTES])
+    if len(bad) > MAX_NOTES:
+        notes += (f"{len(bad) - MAX_NOTES} more track poses cannot be used: left out",)
+    return TrackPiece(stamps[kept], positions[kept], header_ns, notes)
+
+
+def _poses(msg: Any) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     check_type(msg, PATH, "track")
     check_frame(msg, "track")
     n = len(msg.poses)
@@ -65,13 +142,4 @@ def track_from_msg(msg: Any, max_gap_rad: float = DEFAULT_MAX_GAP_RAD) -> Track:
         positions[i] = p.x, p.y, p.z
     if n > 1 and not stamps.any():
         raise AdapterError("track.poses: no pose is stamped (all are 0); expected when the sonar was there")
-    try:
-        return Track(stamps, positions, max_gap_rad=max_gap_rad)
-    except CsasError as error:
-        raise AdapterError(f"track.poses: {error}") from error
-
-
-def track_piece_from_msg(msg):
-    from csas_shadow_ros.core.geometry.runs import TrackPiece
-    t = track_from_msg(msg)
-    return TrackPiece(t.stamps_ns, t.positions_m, stamp_to_ns(msg.header.stamp))
+    return stamps, positions

@@ -25,8 +25,11 @@ from .frames import (
     unit_to_sonar,
     wrap_angle,
 )
+from .passage import Passage, passage
+from .runs import TrackBook, TrackPiece
 from .track import (
     AspectGap,
+    DoubtfulArc,
     Track,
 )
 from .views import (
@@ -42,10 +45,14 @@ __all__ = [
     "Acoustics",
     "AspectGap",
     "CoherentImage",
+    "DoubtfulArc",
     "FloatArray",
     "GroundGrid",
+    "Passage",
     "ShadowCamera",
     "Track",
+    "TrackBook",
+    "TrackPiece",
     "View",
     "ViewInfo",
     "aspects_of_step",
@@ -53,6 +60,7 @@ __all__ = [
     "down_range_axis",
     "fit_target_to_focus",
     "looks_at",
+    "passage",
     "shadow_matrix",
     "unit_to_sonar",
     "view_ground_to_pixel",

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import TrackError, check_range
 from .frames import TWO_PI, FloatArray, wrap_angle
@@ -25,6 +26,35 @@ class AspectGap:
         return f"{start:.1f}° to {start + math.degrees(self.width_rad):.1f}°"
 
 
+@dataclass(frozen=True)
+class DoubtfulArc(AspectGap):
+    """An arc that the track passes more than once, from places that are not the same.
+
+    Parameters
+    ----------
+    start_rad, width_rad : float
+        The arc, counter-clockwise.
+    times : int
+        How often the track passes it.
+    apart_m : float
+        How far apart these passages are at most.
+    """
+
+    times: int
+    apart_m: float
+
+    def why(self, aspect_rad: float) -> str:
+        """Say why there is no position at an aspect of this arc."""
+        return (
+            f"the track passes aspect {math.degrees(aspect_rad) % 360.0:.1f}° {self.times} times, up to"
+            f" {self.apart_m:.1f} m apart, and no stamp tells which passage counts"
+        )
+
+    def contains(self, aspect_rad: float) -> bool:
+        """Say whether the aspect lies in this arc."""
+        return float(np.mod(aspect_rad - self.start_rad, TWO_PI)) <= self.width_rad
+
+
 class Track:
     """Sonar poses along the circle.
 
@@ -36,6 +66,11 @@ class Track:
         Positions in the scene frame, metres.
     max_gap_rad : float
         An arc between neighbouring poses wider than this is a gap: no view is made in it.
+    breaks : array_like of int
+        Poses i that the sonar did not go on from to pose i + 1: what lay between was left out, and they are
+        no neighbours (see `passage`).
+    doubtful : sequence of DoubtfulArc
+        Arcs where it is not known which of several passages counts: they count as gaps.
 
     Raises
     ------
@@ -45,7 +80,13 @@ class Track:
     """
 
     def __init__(
-        self, stamps_ns: ArrayLike, positions_m: ArrayLike, *, max_gap_rad: float = math.radians(3.0)
+        self,
+        stamps_ns: ArrayLike,
+        positions_m: ArrayLike,
+        *,
+        max_gap_rad: float = math.radians(3.0),
+        breaks: ArrayLike = (),
+        doubtful: Sequence[DoubtfulArc] = (),
     ) -> None:
         stamps = np.asarray(stamps_ns, dtype=np.int64)
         positions = np.array(positions_m, dtype=np.float64)
@@ -78,6 +119,12 @@ class Track:
         self.max_gap_rad = check_range("max_gap_rad", max_gap_rad, 0, math.pi, "rad", open_low=True)
         #: Aspect of each pose, unwrapped along the track (rad).
         self.aspects_rad = np.unwrap(np.arctan2(positions[:, 1], positions[:, 0]))
+        self.breaks = np.array(breaks, dtype=np.int64).reshape(-1)
+        if self.breaks.size and not 0 <= self.breaks.min() <= self.breaks.max() < len(stamps) - 1:
+            raise TrackError(
+                f"track breaks are {self.breaks.tolist()}; expected poses 0 to {len(stamps) - 2}"
+            )
+        self.doubtful = tuple(doubtful)
         for array in (self.stamps_ns, self.positions_m, self.aspects_rad):
             array.flags.writeable = False
 
@@ -104,12 +151,18 @@ class Track:
     def _steps(self) -> FloatArray:
         return np.diff(self.aspects_rad)
 
+    def _connected(self) -> NDArray[np.bool_]:
+        """Say of each pose but the last whether the arc to the next one was passed."""
+        connected = np.abs(self._steps()) <= self.max_gap_rad
+        connected[self.breaks] = False
+        return connected
+
     @cached_property
     def gaps(self) -> tuple[AspectGap, ...]:
         """Arcs of the full circle that no pair of neighbouring poses spans."""
         steps = self._steps()
         lo = np.minimum(self.aspects_rad[:-1], self.aspects_rad[1:])
-        covered = np.abs(steps) <= self.max_gap_rad
+        covered = self._connected()
         arcs = [(float(s % TWO_PI), float(abs(w))) for s, w in zip(lo[covered], steps[covered], strict=True)]
         closing = float(wrap_angle(self.aspects_rad[0] - self.aspects_rad[-1]))
         if abs(self.aspects_rad[-1] - self.aspects_rad[0]) > math.pi and 0 < abs(closing) <= self.max_gap_rad:
@@ -129,7 +182,7 @@ class Track:
             reach = max(reach, start + width)
         if first + TWO_PI > reach + 1e-9:
             gaps.append(AspectGap(reach % TWO_PI, first + TWO_PI - reach))
-        return tuple(gaps)
+        return tuple(gaps) if not self.doubtful else _union([*gaps, *self.doubtful])
 
     @property
     def coverage_rad(self) -> float:
@@ -161,13 +214,16 @@ class Track:
         Raises
         ------
         TrackError
-            If the track has a gap there.
+            If the track has a gap there, or it is not known which of several passages counts.
         """
+        for arc in self.doubtful:
+            if arc.contains(aspect_rad):
+                raise TrackError(arc.why(aspect_rad))
         a = self.aspects_rad
         # Number of whole turns between the wanted aspect and each pose: it changes where the track
         # crosses the aspect, whatever the direction and however the track wobbles.
         turns = np.floor((a - aspect_rad) / TWO_PI + 1e-12)
-        crossing = np.flatnonzero((np.diff(turns) != 0) & (np.abs(self._steps()) <= self.max_gap_rad))
+        crossing = np.flatnonzero((np.diff(turns) != 0) & self._connected())
         # A pose may sit exactly on the aspect without a crossing: at the track's start, or beside a gap.
         exact = np.flatnonzero(np.abs(wrap_angle(a - aspect_rad)) < 1e-9)
         if exact.size and (not crossing.size or exact[0] <= crossing[0]):
@@ -197,3 +253,18 @@ class Track:
                 (1.0 - f) * self.positions_m[-1] + f * self.positions_m[0],
             )
         raise TrackError(f"the track has no pose at aspect {math.degrees(aspect_rad) % 360.0:.2f}°")
+
+
+def _union(arcs: Sequence[AspectGap]) -> tuple[AspectGap, ...]:
+    """Return arcs of the circle without overlaps."""
+    ends = sorted((arc.start_rad % TWO_PI, arc.start_rad % TWO_PI + arc.width_rad) for arc in arcs)
+    joined: list[list[float]] = []
+    for start, end in ends:
+        if joined and start <= joined[-1][1] + 1e-9:
+            joined[-1][1] = max(joined[-1][1], end)
+        else:
+            joined.append([start, end])
+    # The last may reach over 0 into the first ones.
+    while len(joined) > 1 and joined[-1][1] >= joined[0][0] + TWO_PI - 1e-9:
+        joined[-1][1] = max(joined[-1][1], joined.pop(0)[1] + TWO_PI)
+    return tuple(AspectGap(start, min(end - start, TWO_PI)) for start, end in joined)

@@ -53,7 +53,8 @@ class RunFollower:
         """
         if not self.book.names or self.run_of(stamp_ns) is not None:
             return "", 0.0
-        return f"no track covers its stamp ({self.book.describe()})", HOLD_S
+        spans = ", ".join("{} to {} ns".format(*self.book.span(name)) for name in self.book.names)
+        return f"no track covers its stamp (tracks go from {spans})", HOLD_S
 
     def image_hold(self, stamp_ns: int) -> tuple[str, float]:
         """Say the same of an image, which has to wait for a track for as long as there is none at all."""
