@@ -264,6 +264,7 @@ def _from_image(
             workers=workers,
             max_objects=max_objects,
             spectrum=None if run.image is not None else run.sector_sum().spectrum,
+            run_ns=run.run_ns,
         )
     except SpectrumSignError as error:
         raise SpectrumSignError(

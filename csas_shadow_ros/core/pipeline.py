@@ -15,6 +15,7 @@ from typing import Any
 
 from .errors import ViewError, check_range
 from .geometry import CoherentImage, Track, View
+from .geometry.passage import passage
 from .hollows import EchoLook
 from .likelihood import Levels, outside_likelihood, view_levels
 from .measurement import SilhouetteSides, silhouette_sides
@@ -25,7 +26,7 @@ from .segmentation import segment_shadow
 from .shadow import enhance
 from .shape.result import Result
 from .subaperture import Spectrum, SubApertures
-from .volume import Target, Volume
+from .volume import Target
 
 
 class ProcessedView:
@@ -49,8 +50,7 @@ class ProcessedView:
 
     def require(self, part: str) -> Any:
         """Return a part, or raise a ViewError where what is there does not tell it."""
-        made = getattr(self, part)
-        if made is None:
+        if (made := getattr(self, part)) is None:
             raise ViewError(f"a view's {part} cannot be made: what comes before it is not there")
         return made
 
@@ -93,14 +93,14 @@ class ProcessedView:
         """Where the view is dark round the target (beyond the paper: hollows)."""
         if self.levels is None or self.shadow is None or self.target is None:
             return None
-        volume = Volume.around(self.target.position_m, self.target.size_m, self.p.carving.voxel_size_m)
+        volume = self.target.volume(self.p.carving.voxel_size_m)
         return EchoLook.of(self.levels, self.shadow.info, volume)
 
 
 def process(view: View, stage: str, decision: Decision, p: PipelineParameters) -> list[ProcessedView]:
     """Take one view from its stage on, for every body: the target; from sub-apertures the others, too."""
-    others = decision.others if stage == "sub_aperture" else ()
-    return [ProcessedView(body, p, **{stage: view}) for body in (decision.target, *others)]
+    bodies = (decision.target, *(decision.others if stage == "sub_aperture" else ()))
+    return [ProcessedView(body, p, **{stage: view}) for body in bodies]
 
 
 def run(
@@ -113,36 +113,38 @@ def run(
     workers: int = 2,
     max_objects: int = MAX_OBJECTS,
     spectrum: Spectrum | None = None,
+    run_ns: int | None = None,
 ) -> Result:
     """Reconstruct the target of a circular run, and what else stands there, from their shadows.
 
-    `progress` is called with (views done, views in all), `on_view` with every processed view in order of
-    aspect. `workers` are threads. At most `max_objects` bodies are carved, the target among them (nothing of
-    the target's result depends on it). `spectrum` is the image's, if it was made before.
+    `progress` is called with (views done, views in all), `on_view` with every view in order of aspect. At
+    most `max_objects` bodies are carved, which changes nothing of the target's result. `spectrum` is the
+    image's, if it was made before; `run_ns` names the run (by default: stamp of the track's first pose).
 
     Raises
     ------
-    ParameterError
-        If `max_objects` is out of range.
-    SpectrumSignError
-        If the shadows contradict the stated spectrum sign.
-    NoTargetError
-        If a target position was given and nothing is there.
+    ParameterError, SpectrumSignError, NoTargetError
+        If `max_objects` is out of range, the shadows contradict the stated spectrum sign, or nothing is at
+        a target position that was given.
     """
     p = parameters or PipelineParameters()
     check_range("max_objects", max_objects, 1, MOST_OBJECTS)
     began = time.perf_counter()
+    name = int(track.stamps_ns[0]) if run_ns is None else run_ns
+    track = passage(track, image_ns=image.stamp_ns or None).track  # what lies off the circle tells nothing
     spectrum = spectrum or Spectrum.of_image(image, workers)
     decision = decide_by_image(image, track, p, spectrum=spectrum, max_objects=max_objects)
     views = SubApertures(image, track, p.sub_aperture, spectrum=spectrum)  # 3.1 spectral masking
-    reconstruction = Reconstruction(decision, p, run_ns=int(track.stamps_ns[0]))
+    reconstruction = Reconstruction(decision, p, run_ns=name)
     reconstruction.timings_s["search"] = time.perf_counter() - began
-
-    def make(aspect_rad: float) -> list[ProcessedView]:
-        return process(views.view_of_aspect(aspect_rad), "sub_aperture", decision, p)
-
-    aspects = [float(a) for a in views.aspects_rad]
-    reconstruction.feed(aspects, make, len(aspects), progress=progress, on_view=on_view, workers=workers)
+    reconstruction.feed(
+        [float(aspect) for aspect in views.aspects_rad],
+        lambda aspect: process(views.view_of_aspect(aspect), "sub_aperture", decision, p),
+        len(views.aspects_rad),
+        progress=progress,
+        on_view=on_view,
+        workers=workers,
+    )
     return reconstruction.result()  # 4 carving, surface extraction; sizes and hollows
 
 

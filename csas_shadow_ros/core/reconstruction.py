@@ -31,7 +31,7 @@ from .shape.pieces import objects_of
 from .shape.result import LeftOut, ObjectResult, Result, ViewEvidence
 from .shape.verdict import judge
 from .threads import in_order
-from .volume import Target, Volume, VoxelGrid
+from .volume import Target, VoxelGrid
 
 if TYPE_CHECKING:
     import trimesh
@@ -68,7 +68,7 @@ class Body:
         pool: ThreadPoolExecutor | None = None,
     ) -> None:
         p = parameters.carving
-        volume = Volume.around(target.position_m, target.size_m, p.voxel_size_m)
+        volume = target.volume(p.voxel_size_m)
         self.target = target
         self.carver = Carver(volume, p, pool=pool)
         self.other = Carver(volume, p.other(), pool=pool) if compare else None

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from .arcs import TOLERANCE_RAD, Arc, Arcs
 from .errors import GeometryError, NoTargetError, ViewError
 from .geometry import TWO_PI, CoherentImage, Track
+from .geometry.passage import passage
 from .parameters import MAX_OBJECTS, PipelineParameters, SubApertureParameters, TargetParameters
 from .search.decision import Decision, decide_by_image
 from .sector import Sector, unlike
@@ -284,6 +285,15 @@ def part_of_track(track: Track, arcs: Arcs) -> Track | None:
     return Track(track.stamps_ns[inside], track.positions_m[inside], max_gap_rad=track.max_gap_rad)
 
 
+def same_track(a: Track, b: Track) -> bool:
+    """Say whether two tracks hold the same poses, and doubt the same arcs."""
+    return (
+        np.array_equal(a.stamps_ns, b.stamps_ns)
+        and np.array_equal(a.positions_m, b.positions_m)
+        and a.doubtful == b.doubtful
+    )
+
+
 class Stream:
     """What can be made of a run that is still going on.
 
@@ -316,7 +326,12 @@ class Stream:
         self.target_parameters = target or TargetParameters()
         self._workers = workers
         self.sum = SectorSum(workers)
+        #: The part of the track that counts, and what was left out of it.
         self.track: Track | None = None
+        self.notes: tuple[str, ...] = ()
+        self._poses: Track | None = None
+        self._image_ns: int | None = None
+        self._sectors: list[tuple[int, float, float]] = []
         self.sub_apertures: SubApertures | None = None
         self.max_objects = max_objects
         #: What is carved, for the time being or for good; None before it is decided on.
@@ -345,11 +360,22 @@ class Stream:
         return None if self.decision is None else self.decision.target
 
     def take_track(self, track: Track) -> bool:
-        """Take the track, or a longer one; False if it is not longer."""
-        if self.track is not None and len(track) <= len(self.track):
+        """Take all poses of the run that are known by now; False if nothing changes by them."""
+        if self._poses is not None and len(track) < len(self._poses):
+            return False
+        self._poses = track
+        return self._choose_passage()
+
+    def _choose_passage(self) -> bool:
+        """Choose which of the poses count, by the stamps that are here."""
+        if self._poses is None:
+            return False
+        chosen = passage(self._poses, image_ns=self._image_ns, sectors=self._sectors)
+        self.notes = chosen.notes
+        if self.track is not None and same_track(chosen.track, self.track):
             return False
         self._stale |= bool(self._given)
-        self.track, self.sub_apertures, self.final = track, None, False
+        self.track, self.sub_apertures, self.final = chosen.track, None, False
         return True
 
     def add(self, sector: Sector) -> bool:
@@ -366,6 +392,11 @@ class Stream:
             self.counts["repeated"] += 1
             return False
         self.counts["sectors"] += 1
+        self._sectors.append(
+            (sector.stamp_ns, sector.aspect_rad - sector.aperture_rad / 2.0, sector.aperture_rad)
+        )
+        if self.notes:
+            self._choose_passage()  # a plain circle does not depend on what names it
         self.counts["out_of_order"] += sector.stamp_ns < newest
         if self.final or any(changed.touches(self._arc_of(self._aspect_of[s])) for s in self._given):
             self.counts["late"] += 1
@@ -388,6 +419,8 @@ class Stream:
                 " expected one or the other"
             )
         self.sum, self._all_here = SectorSum.of_image(image, self._workers), True
+        self._image_ns = image.stamp_ns
+        self._choose_passage()
 
     def finish(self) -> None:
         """Say that no more sectors are to come; those that come nevertheless are late."""
@@ -510,6 +543,8 @@ class StreamedRun:
         Threads.
     max_objects : int
         At most so many bodies are carved, the target among them.
+    run_ns : int, optional
+        The run's name; by default the stamp of the track's first pose.
     """
 
     def __init__(
@@ -519,6 +554,7 @@ class StreamedRun:
         first_search_deg: float = 120.0,
         workers: int = 2,
         max_objects: int = MAX_OBJECTS,
+        run_ns: int | None = None,
     ) -> None:
         p = self.parameters = parameters or PipelineParameters()
         self.stream = Stream(
@@ -528,6 +564,7 @@ class StreamedRun:
             workers=workers,
             max_objects=max_objects,
         )
+        self.run_ns = run_ns
         self.reconstruction: Reconstruction | None = None
         self._workers = workers
         self._revision = 0
@@ -535,6 +572,8 @@ class StreamedRun:
     def take_track(self, track: Track) -> list[ProcessedView]:
         """Take the track, or a longer one; return the views that became due."""
         self.stream.take_track(track)
+        if self.run_ns is None:
+            self.run_ns = int(track.stamps_ns[0])
         return self._advance()
 
     def add(self, sector: Sector) -> list[ProcessedView]:
@@ -554,12 +593,12 @@ class StreamedRun:
 
         stream, p = self.stream, self.parameters
         due = [stream.aspect_of(stamp) for stamp in stream.update()]
-        decision, sub_apertures, track = stream.decision, stream.sub_apertures, stream.track
-        if decision is None or sub_apertures is None or track is None:
+        decision, sub_apertures = stream.decision, stream.sub_apertures
+        if decision is None or sub_apertures is None:
             return []
         if self.reconstruction is None or stream.revision != self._revision:
             self._revision = stream.revision
-            self.reconstruction = Reconstruction(decision, p, run_ns=int(track.stamps_ns[0]))
+            self.reconstruction = Reconstruction(decision, p, run_ns=self.run_ns)
         self.reconstruction.settle(decision)
         made: list[ProcessedView] = []
         self.reconstruction.feed(

@@ -44,6 +44,10 @@ class Target:
         """Distance from the middle within which the target's own shadows begin (margin excluded)."""
         return 0.5 * math.hypot(self.size_m[0], self.size_m[1]) / (1.0 + 2.0 * MARGIN_SHARE)
 
+    def volume(self, voxel_size_m: float) -> Volume:
+        """Return the lattice that is carved."""
+        return Volume.around(self.position_m, self.size_m, voxel_size_m)
+
 
 @dataclass(frozen=True)
 class Volume:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from csas_shadow_ros.bags.check import ERROR, judge_band, judge_coverage, judge_geometry, judge_image
-from csas_shadow_ros.core.errors import CsasError, ViewError
+from csas_shadow_ros.core.errors import CsasError, TrackError, ViewError
 from csas_shadow_ros.core.geometry import CoherentImage
 from csas_shadow_ros.core.parameters import SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.search.decision import Decision
@@ -225,7 +225,7 @@ class SubApertureNode(CsasNode):
             if run.name is None and run.stream.sum.stamps:
                 run.name = self.track.run_of(min(run.stream.sum.stamps))
             if run.name == name:
-                run.stream.take_track(self.track.book.track(name))
+                self.give_track(run)
         held, self.unplaced = self.unplaced, []
         for since_s, image, info in held:
             self.guard("image", self.place_image, image, info, since_s)
@@ -276,9 +276,21 @@ class SubApertureNode(CsasNode):
             first_search_deg=p.first_search_deg,
             max_objects=p.max_objects,
         )
+        run = Run(name, stream)
         if name is not None:
-            stream.take_track(self.track.book.track(name))
-        return Run(name, stream)
+            self.give_track(run)
+        return run
+
+    def give_track(self, run: Run) -> None:
+        """Give a run all of its poses that are known; say what of them does not count."""
+        if run.name is None:
+            return
+        try:
+            run.stream.take_track(self.track.book.track(run.name))
+        except TrackError as error:
+            self.log_throttled("track", f"track of the run of {run.name} ns: {error}", "warn")  # it may grow
+        for note in (*self.track.book.notes(run.name), *run.stream.notes):
+            self.log_throttled(note, note, "warn")
 
     def on_source(self, beat: Heartbeat) -> None:
         """Close the run once the source of the sectors says that they are all here."""
