@@ -7,25 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from msg_adapters.camera_info import GroundInfo
-from msg_adapters.mesh import mesh_to_msg
 from msg_adapters.messages import RosbagsMessages
-from msg_adapters.pairs import (
-    coherent_image_to_msgs,
-    ground_picture_to_msgs,
-    view_to_msgs,
-    voxel_grid_to_msgs,
-)
+from msg_adapters.pairs import coherent_image_to_msgs, ground_picture_to_msgs, view_to_msgs
+from msg_adapters.result import result_to_msgs
 from msg_adapters.target import TargetBox, target_to_msg
-from msg_adapters.topics import NAMESPACE, STREAMS, TOPICS, absolute_name
+from msg_adapters.topics import LATCHED, NAMESPACE, STREAMS, TOPICS, absolute_name, topic
 from msg_adapters.track import track_to_msg
-from msg_adapters.voxels import voxels_to_msg
 
 from ..bags import BagReader, BagWriter
 from ..core.geometry import Acoustics, CoherentImage, Track, View
 from ..core.pipeline import Result
-
-_LATCHED = ("image", "camera_info", "track", "target", "mesh", "voxels")
-_LATCHED_STREAMS = ("multilook", "color_by_aspect", "voxel_grid", "voxel_views")
+from ..core.shape import result as plain
 
 
 class ResultBag:
@@ -48,9 +40,9 @@ class ResultBag:
         self._acoustics: Acoustics | None = None
         self._last_ns = 0
         self._adopted = False
-        names = [*_LATCHED, *(f"{s}/{kind}" for s in _LATCHED_STREAMS for kind in ("image", "camera_info"))]
-        for name in names:
-            self._writer.add_topic(absolute_name(name), TOPICS[name].type_name, depth=1)
+        for name in TOPICS:
+            if name in LATCHED:
+                self._writer.add_topic(absolute_name(name), TOPICS[name].type_name, depth=1)
 
     def _write(self, relative: str, message: Any, when_ns: int | None = None) -> None:
         self._writer.write(absolute_name(relative), message, when_ns)
@@ -133,19 +125,36 @@ class ResultBag:
                 picture, camera = ground_picture_to_msgs(factory, pixels, info, name)
                 self._write(STREAMS[name].info_topic, camera)
                 self._write(STREAMS[name].image_topic, picture)
-        grid = result.grid
-        if grid is not None:
-            picture, camera = voxel_grid_to_msgs(factory, grid.volume, grid.likelihood, when)
-            self._write("voxel_grid/camera_info", camera)
-            self._write("voxel_grid/image", picture)
-            picture, camera = voxel_grid_to_msgs(factory, grid.volume, grid.views, when, "voxel_views")
-            self._write("voxel_views/camera_info", camera)
-            self._write("voxel_views/image", picture)
-            self._write("voxels", voxels_to_msg(factory, grid, when))
-        box = None if grid is None else TargetBox.of(grid.volume)
+        box = None if result.grid is None else TargetBox.of(result.grid.volume)
         self._write("target", target_to_msg(factory, box, when))
-        self._write("mesh", mesh_to_msg(factory, result.mesh, when))
+        for name, message in result_to_msgs(factory, _as_plain(result, when), stamp_ns=when):
+            # Those under a prefix are not known beforehand.
+            self._writer.add_topic(absolute_name(name), topic(name).type_name, depth=1)
+            self._write(name, message, when)
 
     def abandon(self) -> None:
         """Close what has been written; the folder is not going to be kept."""
         self._writer.close()
+
+
+def _as_plain(result: Result | plain.Result, stamp_ns: int) -> plain.Result:
+    """Return the plain data of what the pipeline left in this process."""
+    if isinstance(result, plain.Result):
+        return result
+    return plain.Result(
+        stamp_ns=stamp_ns,
+        verdict="object" if result.objects else "no object",
+        target=result.target,
+        sign=result.sign,
+        grid=result.grid,
+        other_grid=result.other_grid,
+        mesh=result.mesh,
+        dimensions=result.dimensions,
+        matter=result.matter,
+        matter_mesh=result.matter_mesh,
+        views_used=result.views_used,
+        further=[
+            plain.ObjectResult(o.target, o.grid, o.mesh, o.dimensions, o.views_used) for o in result.further
+        ],
+        left_out=[plain.LeftOut(body.position_m, body.reason) for body in result.left_out],
+    )
