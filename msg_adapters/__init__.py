@@ -19,11 +19,12 @@ from .camera_info import (
     view_info_from_msg,
     view_info_to_msg,
 )
+from .evidence import evidence_from_msg, evidence_to_msg
 from .image import check_pixels, image_from_msg, image_to_msg, pixels_from_msg, quantise
 from .measurements import (
+    GridFacts,
+    MeasuredObject,
     Measurements,
-    evidence_from_msg,
-    evidence_to_msg,
     measurements_from_msg,
     measurements_to_msg,
 )
@@ -38,7 +39,7 @@ from .messages import (
     stamp_to_ns,
     type_name_of,
 )
-from .objects import objects_from_msg, objects_to_msg
+from .objects import ObjectBox, objects_from_msg, objects_to_msg
 from .pairs import (
     Pairer,
     coherent_image_from_msgs,
@@ -61,30 +62,51 @@ from .progress import (
     progress_from_msg,
     progress_to_msg,
 )
-from .result import result_from_msgs, result_to_msgs, topics_of_result
-from .search import SearchMessage, decision_from_msg, decision_to_msg
+from .result import result_from_msgs, result_to_msgs
+from .search import SearchNews, decision_from_msg, decision_to_msg
 from .target import TargetBox, target_from_msg, target_may_move, target_to_msg
-from .topics import NAMESPACE, STREAMS, TOPICS, VIEW_STREAMS, ImageStream, Topic, absolute_name, topic
+from .topics import (
+    LATCHED,
+    NAMESPACE,
+    STREAMS,
+    TOPICS,
+    VIEW_STREAMS,
+    VOXEL_STREAMS,
+    ImageStream,
+    Topic,
+    absolute_name,
+    is_latched,
+    object_prefix,
+    prefixed,
+    split_prefix,
+    stream,
+    topic,
+)
 from .track import track_from_msg, track_piece_from_msg, track_to_msg
 from .voxels import Voxels, voxels_from_msg, voxels_to_msg
 
 __all__ = [
+    "LATCHED",
     "NAMESPACE",
     "SCENE_FRAME",
     "STREAMS",
     "TOPICS",
     "VIEW_STREAMS",
+    "VOXEL_STREAMS",
     "AdapterError",
+    "GridFacts",
     "GroundInfo",
     "Heartbeat",
     "ImageStream",
     "Level",
+    "MeasuredObject",
     "Measurements",
     "MessageFactory",
+    "ObjectBox",
     "Pairer",
     "RclpyMessages",
     "RosbagsMessages",
-    "SearchMessage",
+    "SearchNews",
     "SectorInfo",
     "TargetBox",
     "Topic",
@@ -106,15 +128,18 @@ __all__ = [
     "ground_picture_to_msgs",
     "image_from_msg",
     "image_to_msg",
+    "is_latched",
     "is_routine_report",
     "measurements_from_msg",
     "measurements_to_msg",
     "mesh_from_msg",
     "mesh_to_msg",
     "message_from_cdr",
+    "object_prefix",
     "objects_from_msg",
     "objects_to_msg",
     "pixels_from_msg",
+    "prefixed",
     "progress_from_msg",
     "progress_to_msg",
     "quantise",
@@ -124,13 +149,14 @@ __all__ = [
     "sector_info_from_msg",
     "sector_info_to_msg",
     "sector_to_msgs",
+    "split_prefix",
     "stamp_from_ns",
     "stamp_to_ns",
+    "stream",
     "target_from_msg",
     "target_may_move",
     "target_to_msg",
     "topic",
-    "topics_of_result",
     "track_from_msg",
     "track_piece_from_msg",
     "track_to_msg",

@@ -321,7 +321,7 @@ def voxel_info_to_msg(factory: MessageFactory, volume: Volume, stamp_ns: int) ->
     return _make_ground(factory, stamp_ns, grid, CSAS_VOXEL_GRID, [z, volume.voxel_size_m])
 
 
-def voxel_info_from_msg(msg: Any, layers: int) -> tuple[int, Volume]:
+def voxel_info_from_msg(msg: Any, layers: int, stream_name: str = "voxel_grid") -> tuple[int, Volume]:
     """Read the CameraInfo of a dense voxel grid.
 
     Parameters
@@ -330,6 +330,8 @@ def voxel_info_from_msg(msg: Any, layers: int) -> tuple[int, Volume]:
         Of either message world.
     layers : int
         Channels of the image that belongs to it.
+    stream_name : str
+        The stream that it is of.
 
     Returns
     -------
@@ -341,7 +343,7 @@ def voxel_info_from_msg(msg: Any, layers: int) -> tuple[int, Volume]:
     AdapterError
         Naming the field that breaks the contract; also if the voxels are not cubes.
     """
-    where = stream("voxel_grid").info_topic
+    where = stream(stream_name).info_topic
     check_type(msg, CAMERA_INFO, where)
     check_frame(msg, where)
     d = _entries(msg, (CSAS_VOXEL_GRID,), where)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from csas_shadow_ros.core.errors import AdapterError
 
 from .messages import MessageFactory, check_frame, check_type, make_header
-from .topics import IMAGE, VOXEL_ENCODING, ImageStream, stream
+from .topics import IMAGE, MATTER_ENCODING, VOXEL_ENCODING, ImageStream, stream
 
 MAX_SIDE = 1 << 16
 MAX_BYTES = (1 << 32) - 1  # the length of a ROS sequence is a uint32
@@ -29,11 +29,21 @@ _FIXED: dict[str, tuple[str, int, bool]] = {
 }
 
 
+#: Scalars of the encodings whose channels are heights.
+_VOXEL_SCALARS = {VOXEL_ENCODING: "f4", MATTER_ENCODING: "u1"}
+
+
+def _is_voxels(encodings: tuple[str, ...]) -> bool:
+    return not _VOXEL_SCALARS.keys().isdisjoint(encodings)
+
+
 def _layout(encoding: str, allowed: tuple[str, ...], where: str) -> tuple[str, int, bool]:
-    if VOXEL_ENCODING in allowed:
-        match = re.fullmatch(r"32FC([1-9]\d{0,4})", encoding)
-        if match:
-            return "f4", int(match.group(1)), False
+    if _is_voxels(allowed):
+        # A channel a height: 32FC3 of 32FCn.
+        for kind in allowed:
+            match = re.fullmatch(kind[:-1] + r"([1-9]\d{0,4})", encoding)
+            if match:
+                return _VOXEL_SCALARS[kind], int(match.group(1)), False
     elif encoding in allowed and encoding in _FIXED:
         return _FIXED[encoding]
     raise AdapterError(f"{where}.encoding is {encoding!r}; expected one of: {', '.join(allowed)}")
@@ -107,7 +117,7 @@ def pixels_from_msg(msg: Any, encodings: tuple[str, ...], where: str = "image") 
     else:
         # A copy only if the byte order is foreign or the memory not aligned (as in a bag's chunk).
         pixels = np.require(pixels, native, "A")
-        if channels == 1 and VOXEL_ENCODING not in encodings:
+        if channels == 1 and not _is_voxels(encodings):
             pixels = pixels[..., 0]
     pixels.flags.writeable = False
     return pixels
@@ -175,9 +185,11 @@ def image_to_msg(
     kind = stream(stream_name)
     where = kind.image_topic
     if encoding is None:
-        encoding = f"32FC{pixels.shape[-1]}" if VOXEL_ENCODING in kind.encodings else kind.encodings[0]
+        encoding = kind.encodings[0]
+        if _is_voxels(kind.encodings):
+            encoding = f"{encoding[:-1]}{pixels.shape[-1]}"
     scalar, channels, is_complex = _layout(encoding, kind.encodings, where)
-    flat = is_complex or (channels == 1 and VOXEL_ENCODING not in kind.encodings)
+    flat = is_complex or (channels == 1 and not _is_voxels(kind.encodings))
     if pixels.ndim != (2 if flat else 3) or (not flat and pixels.shape[2] != channels):
         expected = "(rows, cols)" if flat else f"(rows, cols, {channels})"
         raise AdapterError(f"{where} has shape {pixels.shape}; expected {expected} for {encoding}")
@@ -262,8 +274,8 @@ def check_pixels(pixels: NDArray[Any], kind: ImageStream) -> None:
     """Refuse pixels that break the stream's rule.
 
     Coherent images must be finite. Views may hold NaN where they know nothing, never infinities;
-    amplitudes are not negative, likelihoods lie in [0, 1], masks hold 0, 64, 128 and 255. An image
-    that holds only zeros, or a view that knows nothing at all, is no measurement.
+    amplitudes are not negative, likelihoods lie in [0, 1], masks hold 0, 64, 128 and 255, matter
+    0 and 255. An image that holds only zeros, or a view that knows nothing at all, is no measurement.
 
     Raises
     ------
@@ -278,6 +290,9 @@ def check_pixels(pixels: NDArray[Any], kind: ImageStream) -> None:
             ~np.isin(pixels, (0, 64, 128, 255)), pixels, where, "none of 0, 64, 128, 255", "0, 64, 128 or 255"
         )
         return
+    if content == "matter":
+        _refuse((pixels != 0) & (pixels != 255), pixels, where, "neither 0 nor 255", "0 or 255")
+        return
     finite = np.isfinite(pixels)
     if content == "count":
         _refuse(~finite | (pixels < 0), pixels, where, "not counts", "numbers of views, 0 or more")
@@ -289,7 +304,7 @@ def check_pixels(pixels: NDArray[Any], kind: ImageStream) -> None:
         if not finite.all():
             infinite = ~finite & ~np.isnan(pixels)
             _refuse(infinite, pixels, where, "infinite", "finite numbers, or NaN for no data")
-        if not finite.any() and kind.name != "voxel_grid":
+        if not finite.any() and not _is_voxels(kind.encodings):
             raise AdapterError(f"{where} holds only NaN; expected at least one pixel with a value")
     if content == "amplitude":
         _refuse(pixels < 0, pixels, where, "negative", "amplitudes of at least 0")

@@ -1,313 +1,358 @@
-"""diagnostic_msgs/DiagnosticArray to and from what was measured: topics `measurements` and `evidence`.
-
-Numbers are written as Python writes them: they come back to the last digit. Units are in the names (``_m``,
-``_m3``, ``_rad``, ``_deg``, ``_ns``). Readers pass over values that they do not know.
-"""
+"""diagnostic_msgs/DiagnosticArray to and from what a run says of its objects, and how sure it is."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from csas_shadow_ros.core.errors import AdapterError
 from csas_shadow_ros.core.mesh import Dimensions
 from csas_shadow_ros.core.seabed import SeabedSlope
-from csas_shadow_ros.core.shape.result import QUALITIES, VERDICTS, LeftOut, Quality, Result, ViewEvidence
-from csas_shadow_ros.core.target import SignEvidence
-from csas_shadow_ros.core.volume import Target, Volume, VoxelGrid
+from csas_shadow_ros.core.shape.result import QUALITIES, VERDICTS, LeftOut, ObjectResult, Quality, Result
+from csas_shadow_ros.core.volume import Target, VoxelGrid
 
-from .messages import MessageFactory, stamp_to_ns
+from .messages import MessageFactory
 from .progress import Level
-from .search import (
+from .statuses import (
+    RUN,
+    Status,
+    Value,
     left_out_of,
     left_out_statuses,
-    sign_of_values,
+    numbered,
+    run_of,
+    sign_of,
     sign_values,
-    target_of_values,
+    statuses_from_msg,
+    statuses_to_msg,
+    target_of,
     target_values,
 )
-from .values import Status, finite, numbered, statuses_from_msg, statuses_to_msg, value_texts
+from .topics import LAST_FURTHER
 
-#: Measures by their names in messages, and where `Dimensions` has them.
-_MEASURES = {
+if TYPE_CHECKING:
+    from csas_shadow_ros.core.target import SignEvidence
+
+_WHERE = "measurements"
+_OBJECT = "object"
+_OTHER = "other method"
+_TARGET = "target_"
+_SEPARATOR = "; "
+_LEVELS = dict(zip(QUALITIES, (Level.OK, Level.WARN, Level.ERROR), strict=True))
+#: Names of the values, by those of `Dimensions.intervals`.
+_KEYS = {
     "length_m": "length_m",
     "width_m": "width_m",
     "height_m": "height_m",
     "volume_m3": "volume_m3",
     "heading_rad": "heading_rad",
-    "x_m": "position_x_m",
-    "y_m": "position_y_m",
+    "position_x_m": "x_m",
+    "position_y_m": "y_m",
+    "hull_top_m": "hull_top_m",
 }
-_LEVELS = dict(zip(QUALITIES, (Level.OK, Level.WARN, Level.ERROR), strict=True))
-_REASONS = "; "
 
 
 @dataclass(frozen=True)
 class GridFacts:
-    """What of a grid does not come with its voxels: the lattice to the last digit, method and threshold."""
+    """What the images of a grid do not hold, or not to the last digit.
 
-    volume: Volume
+    Parameters
+    ----------
+    method, threshold, seabed
+        See `VoxelGrid`.
+    origin_m : (float, float, float)
+        Scene (x, y, z) of the centre of voxel [0, 0, 0].
+    voxel_size_m : float
+        Edge of a voxel.
+    """
+
     method: str
     threshold: float
-    views: int
+    origin_m: tuple[float, float, float]
+    voxel_size_m: float
+    seabed: SeabedSlope | None = None
+
+    @classmethod
+    def of(cls, grid: VoxelGrid) -> GridFacts:
+        """Return a grid's facts."""
+        volume = grid.volume
+        return cls(grid.method, grid.threshold, volume.origin_m, volume.voxel_size_m, grid.seabed)
 
 
 @dataclass(frozen=True)
 class MeasuredObject:
-    """One object as topic `measurements` tells it."""
+    """One object.
 
-    dimensions: Dimensions
+    Parameters
+    ----------
+    number : int
+        1 is the target; further ones have the number of their topics' prefix.
+    target : Target
+        The volume that was carved.
+    dimensions : Dimensions
+        Its measures.
+    grid : GridFacts
+        Of its grid.
+    views_used : int
+        Views in the grid.
+    """
+
+    number: int
     target: Target
+    dimensions: Dimensions
     grid: GridFacts
+    views_used: int
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """What topic `measurements` says.
+    """What a run says of its objects, and how far that can be trusted.
 
     Parameters
     ----------
     stamp_ns : int
-        Newest view in it.
-    objects : tuple of MeasuredObject
-        In their order; of the target its own grid's facts are `main`, whether or not it is an object.
-    main, other : GridFacts or None
-        Of the target's grid, and of the one by the other method.
-    target : Target or None
-        The volume that was carved.
-    run_ns, final, verdict, quality, arc_rad, views_used, slope, sign, left_out
+        Stamp of the message, ns.
+    newest_ns : int
+        Stamp of the newest view in it.
+    run_ns, final, verdict, quality, arc_rad, views_used, target, sign
         See `Result`.
-    hollow : bool or None
-        Whether the object has hollows; None where no echo was looked at.
+    objects : tuple of MeasuredObject
+        By rising number.
+    grid, other_grid : GridFacts or None
+        Of the target's grid by the chosen method and by the other one; None where there is no grid.
+    matter_volume_m3, hollow_volume_m3 : float or None
+        Of the voxels that hold matter, and of the object's others; None where no echo was looked at.
+    left_out : tuple of LeftOut
+        Bodies of the search that are no objects, and why.
     """
 
     stamp_ns: int
-    objects: tuple[MeasuredObject, ...]
-    main: GridFacts | None
-    other: GridFacts | None
-    target: Target | None
+    newest_ns: int
     run_ns: int | None
     final: bool
     verdict: str
     quality: Quality
     arc_rad: float
     views_used: int
-    slope: SeabedSlope | None
-    sign: SignEvidence | None
-    left_out: tuple[LeftOut, ...]
-    hollow: bool | None
+    target: Target | None = None
+    sign: SignEvidence | None = None
+    objects: tuple[MeasuredObject, ...] = ()
+    grid: GridFacts | None = None
+    other_grid: GridFacts | None = None
+    matter_volume_m3: float | None = None
+    hollow_volume_m3: float | None = None
+    left_out: tuple[LeftOut, ...] = ()
 
 
-def dimension_values(d: Dimensions) -> dict[str, Any]:
-    """Return the values that tell an object's measures, with ``.low`` and ``.high`` of 95 % intervals."""
-    numbers = {
-        **{name: getattr(d, name) for name in list(_MEASURES)[:5]},
-        "x_m": d.position_m[0],
-        "y_m": d.position_m[1],
-        "hull_top_m": finite(d.hull_top_m),
-    }
-    values: dict[str, Any] = {}
-    for name, value in numbers.items():
-        values[name] = None if value is None else float(value)
-        if (interval := d.intervals.get(_MEASURES.get(name, ""))) is not None:
-            values[f"{name}.low"], values[f"{name}.high"] = map(float, interval)
-    return values
+def numbered_objects(result: Result) -> dict[int, ObjectResult]:
+    """Return a result's objects by their numbers.
 
-
-def dimensions_of_values(status: Status) -> Dimensions:
-    """Read what `dimension_values` wrote.
+    The target is number 1, and no other object takes that number where its carving left none: a further
+    object's number is that of its topics' prefix.
 
     Raises
     ------
     AdapterError
-        If a measure is missing or no number.
+        If there are more objects than prefixes.
     """
-    intervals = {
-        name: (status.number(f"{key}.low"), status.number(f"{key}.high"))
-        for key, name in _MEASURES.items()
-        if f"{key}.low" in status.values
-    }
-    length, width, height, volume, heading, x, y = (status.number(key) for key in _MEASURES)
-    top = status.number("hull_top_m", math.nan)
-    return Dimensions(length, width, height, volume, heading, (x, y), top, intervals)
+    further = dict(enumerate(result.further, start=2))
+    if further and max(further) > LAST_FURTHER:
+        raise AdapterError(
+            f"the result has {len(further)} further objects; expected at most {LAST_FURTHER - 1}"
+        )
+    return {1: result.objects[0]} | further if len(result.objects) > len(further) else further
 
 
-def figures(d: Dimensions) -> str:
-    """Write an object's size in a line."""
-    size = " x ".join(f"{side:.3f}" for side in (d.length_m, d.width_m, d.height_m))
-    return f"{size} m, heading {math.degrees(d.heading_rad):.1f} deg"
-
-
-def _grid_values(grid: VoxelGrid, views: int) -> dict[str, Any]:
-    v = grid.volume
-    return {
-        "method": grid.method,
-        "threshold": float(grid.threshold),
-        "views": views,
-        "voxel_size_m": float(v.voxel_size_m),
-        **{f"origin_{axis}_m": float(at) for axis, at in zip("xyz", v.origin_m, strict=True)},
-        **{f"voxels_{axis}": int(n) for axis, n in zip("zyx", v.shape, strict=True)},
-    }
-
-
-def _grid_facts(status: Status) -> GridFacts:
-    x, y, z = (status.number(f"origin_{axis}_m") for axis in "xyz")
-    nz, ny, nx = (status.whole(f"voxels_{axis}") for axis in "zyx")
-    volume = Volume((x, y, z), status.number("voxel_size_m"), (nz, ny, nx))
-    method = status.text("method", ("consensus", "hard", "soft"))
-    return GridFacts(volume, method, status.number("threshold"), status.whole("views"))
+def half_width(dimensions: Dimensions, name: str, scale: float = 1.0, digits: int = 3) -> str:
+    """Return half of a measure's 95 % interval as `` ± 0.012``; nothing where there is no interval."""
+    if name not in dimensions.intervals:
+        return ""
+    low, high = dimensions.intervals[name]
+    return f" ± {scale * (high - low) / 2:.{digits}f}"
 
 
 def measurements_to_msg(factory: MessageFactory, result: Result, stamp_ns: int | None = None) -> Any:
-    """Make the message of topic `measurements`.
+    """Make the DiagnosticArray of a result: a status of the run, one an object, and one a body left out.
 
     Parameters
     ----------
     factory : MessageFactory
-        Makes the message.
+        The message world.
     result : Result
-        What was found.
+        What the run leaves. A semicolon in a reason goes out as a comma: semicolons separate reasons.
     stamp_ns : int, optional
-        Stamp; that of the newest view in it by default.
+        Stamp, ns; that of the newest view in it by default.
+
+    Raises
+    ------
+    AdapterError
+        If the verdict or the quality is none of those that there are, or an interval is of no measure.
     """
+    for name, value, allowed in (
+        ("verdict", result.verdict, VERDICTS),
+        ("quality", result.quality.verdict, QUALITIES),
+    ):
+        if value not in allowed:
+            raise AdapterError(f"the result's {name} is {value!r}; expected one of: {', '.join(allowed)}")
     level = _LEVELS[result.quality.verdict]
-    statuses = [
-        Status(
-            f"object {number}",
-            figures(one.dimensions),
-            value_texts(
-                dimension_values(one.dimensions)
-                | _grid_values(one.grid, one.views_used)
-                | target_values(one.target, "target_")
-            ),
-            level,
-        )
-        for number, one in enumerate(result.objects, start=1)
-    ]
-    # A list in one value: no reason may hold what separates them.
-    reasons = [reason.replace(";", ",") for reason in result.quality.reasons]
-    slope = result.grid.seabed if result.grid is not None else None
-    hollow = result.matter is not None and result.matter_mesh is not result.mesh
-    run: dict[str, Any] = {
-        "verdict": result.verdict,
-        "quality": result.quality.verdict,
-        "reasons": _REASONS.join(reasons),
-        "run": result.run_ns,
-        "arc_deg": math.degrees(result.arc_rad),
-        "arc_rad": float(result.arc_rad),
-        "views": result.views_used,
-        "final": result.final,
-        "hollow": None if result.matter is None else hollow,
-        **sign_values(result.sign),
-    }
-    if slope is not None:
-        run |= {
-            "seabed_slope_rad": float(slope.slope_rad),
-            "seabed_slope.believed": slope.believed,
-            "seabed_slope.x": float(slope.gradient[0]),
-            "seabed_slope.y": float(slope.gradient[1]),
-            "seabed_slope.sigma": float(slope.sigma),
-            "seabed_slope.about_x_m": float(slope.about_m[0]),
-            "seabed_slope.about_y_m": float(slope.about_m[1]),
-        }
-    said = f"{result.verdict} ({result.quality.verdict})"
-    statuses.append(Status("run", _REASONS.join([said, *reasons]), value_texts(run), level))
-    if result.target is not None:
-        statuses.append(Status("target", "the carved volume", value_texts(target_values(result.target))))
-    for name, grid in (("grid", result.grid), ("other method", result.other_grid)):
-        if grid is not None:
-            statuses.append(Status(name, grid.method, value_texts(_grid_values(grid, result.views_used))))
+    statuses = [Status.of(RUN, _run_values(result), _run_line(result), level)]
+    for number, one in numbered_objects(result).items():
+        statuses.append(Status.of(f"{_OBJECT} {number}", _object_values(one), _line(one.dimensions), level))
+    if result.other_grid is not None:
+        statuses.append(Status.of(_OTHER, _grid_values(result.other_grid)))
     statuses += left_out_statuses(result.left_out)
     return statuses_to_msg(factory, result.stamp_ns if stamp_ns is None else stamp_ns, statuses)
 
 
-def measurements_from_msg(msg: Any) -> Measurements:
-    """Read the message of topic `measurements`.
-
-    Raises
-    ------
-    AdapterError
-        If a status or a value is missing or wrong.
-    """
-    where = "measurements"
-    statuses = statuses_from_msg(msg, where)
-    run = statuses.get("run")
-    if run is None:
-        raise AdapterError(f"{where} has statuses {sorted(statuses)}; expected one named 'run'")
-    objects = tuple(
-        MeasuredObject(dimensions_of_values(one), target_of_values(one, "target_"), _grid_facts(one))
-        for one in numbered(statuses, "object")
-    )
-    slope = None
-    if "seabed_slope.x" in run.values:
-        gx, gy, sigma, x, y = (
-            run.number(f"seabed_slope.{name}") for name in ("x", "y", "sigma", "about_x_m", "about_y_m")
-        )
-        slope = SeabedSlope((gx, gy), sigma, (x, y))
-    reasons = tuple(reason for reason in run.values.get("reasons", "").split(_REASONS) if reason)
-    facts = {name: _grid_facts(statuses[name]) for name in ("grid", "other method") if name in statuses}
-    hollow = run.values.get("hollow")
-    return Measurements(
-        stamp_to_ns(msg.header.stamp, f"{where}.header.stamp"),
-        objects,
-        facts.get("grid"),
-        facts.get("other method"),
-        target_of_values(statuses["target"]) if "target" in statuses else None,
-        run.whole("run") if "run" in run.values else None,
-        run.values.get("final") != "false",
-        run.text("verdict", VERDICTS),
-        Quality(run.text("quality", QUALITIES), reasons),
-        run.number("arc_rad", math.radians(run.number("arc_deg", 0.0))),
-        run.whole("views", 0),
-        slope,
-        sign_of_values(run),
-        tuple(left_out_of(statuses)),
-        None if hollow is None else hollow == "true",
-    )
+def _reasons(quality: Quality) -> str:
+    return _SEPARATOR.join(reason.replace(";", ",") for reason in quality.reasons)
 
 
-def evidence_to_msg(factory: MessageFactory, evidence: Mapping[int, ViewEvidence], stamp_ns: int) -> Any:
-    """Make the message of topic `evidence`: a status a view, named by its stamp (ns)."""
-    statuses = []
-    for stamp, one in sorted(evidence.items()):
-        values = {
-            "aspect_deg": math.degrees(one.aspect_rad) % 360.0,
-            "aspect_rad": float(one.aspect_rad),
-            **{f"sonar_{axis}_m": float(at) for axis, at in zip("xyz", one.sonar_m, strict=True)},
-            "seabed_level": finite(float(one.seabed_level)),
-            "contrast": finite(float(one.contrast)),
-            "levels_estimated": bool(one.levels_estimated),
-            "height_m": finite(float(one.height_m)),
+def _run_line(result: Result) -> str:
+    reasons = _reasons(result.quality)
+    return f"{result.verdict}, {result.quality.verdict}" + (f": {reasons}" if reasons else "")
+
+
+def _line(d: Dimensions) -> str:
+    heading = math.degrees(d.heading_rad)
+    return f"{d.length_m:.3f} x {d.width_m:.3f} x {d.height_m:.3f} m, heading {heading:.1f} deg"
+
+
+def _run_values(result: Result) -> dict[str, Value]:
+    values: dict[str, Value] = {
+        "verdict": result.verdict,
+        "quality": result.quality.verdict,
+        "reasons": _reasons(result.quality),
+    }
+    if result.run_ns is not None:
+        values["run"] = int(result.run_ns)
+    values |= {
+        "newest": int(result.stamp_ns),
+        "final": bool(result.final),
+        "arc_deg": math.degrees(result.arc_rad),
+        "arc_rad": result.arc_rad,
+        "views": int(result.views_used),
+    }
+    values |= sign_values(result.sign)
+    if result.target is not None:
+        values |= target_values(result.target, _TARGET)
+    if result.grid is not None:
+        values |= _grid_values(result.grid)
+        if result.matter is not None:
+            voxel = result.grid.volume.voxel_size_m**3
+            hollow = result.grid.occupied & ~result.matter
+            values["matter_volume_m3"] = int(np.count_nonzero(result.matter)) * voxel
+            values["hollow_volume_m3"] = int(np.count_nonzero(hollow)) * voxel
+    return values
+
+
+def _grid_values(grid: VoxelGrid) -> dict[str, Value]:
+    x, y, z = grid.volume.origin_m
+    values: dict[str, Value] = {
+        "method": grid.method,
+        "threshold": grid.threshold,
+        "origin_x_m": x,
+        "origin_y_m": y,
+        "origin_z_m": z,
+        "voxel_size_m": grid.volume.voxel_size_m,
+    }
+    if grid.seabed is not None:
+        values |= {
+            "seabed_gradient_x": grid.seabed.gradient[0],
+            "seabed_gradient_y": grid.seabed.gradient[1],
+            "seabed_sigma": grid.seabed.sigma,
+            "seabed_about_x_m": grid.seabed.about_m[0],
+            "seabed_about_y_m": grid.seabed.about_m[1],
+            "seabed_believed": bool(grid.seabed.believed),
         }
-        told = "no height" if math.isnan(one.height_m) else f"{one.height_m:.3f} m high"
-        statuses.append(Status(str(stamp), f"{values['aspect_deg']:.2f} deg: {told}", value_texts(values)))
-    return statuses_to_msg(factory, stamp_ns, statuses)
+    return values
 
 
-def evidence_from_msg(msg: Any) -> dict[int, ViewEvidence]:
-    """Read the message of topic `evidence`.
+def _object_values(one: ObjectResult) -> dict[str, Value]:
+    d = one.dimensions
+    x, y = d.position_m
+    measured = {"position_x_m": x, "position_y_m": y}
+    values: dict[str, Value] = {}
+    for name, key in _KEYS.items():
+        values[key] = measured[name] if name in measured else getattr(d, name)
+        if name in d.intervals:
+            values[f"{key}.low"], values[f"{key}.high"] = d.intervals[name]
+    if unknown := sorted(set(d.intervals) - set(_KEYS)):
+        raise AdapterError(f"there is an interval of {unknown[0]!r}; expected of: {', '.join(_KEYS)}")
+    values["views"] = int(one.views_used)
+    return values | _grid_values(one.grid) | target_values(one.target, _TARGET)
+
+
+def measurements_from_msg(msg: Any) -> Measurements:
+    """Read what a run says of its objects, to the last digit; values that it does not know are passed over.
+
+    Parameters
+    ----------
+    msg : diagnostic_msgs/DiagnosticArray
+        Of either message world.
 
     Raises
     ------
     AdapterError
-        If a status is not named by a stamp, or a value is missing or wrong.
+        Naming the status and the value that are missing or not what they must be.
     """
-    found = {}
-    for name, one in statuses_from_msg(msg, "evidence").items():
-        try:
-            stamp = int(name)
-        except ValueError:
-            raise AdapterError(f"evidence status is named {name!r}; expected a view's stamp in ns") from None
-        x, y, z = (one.number(f"sonar_{axis}_m") for axis in "xyz")
-        found[stamp] = ViewEvidence(
-            stamp,
-            one.number("aspect_rad"),
-            (x, y, z),
-            one.number("seabed_level", math.nan),
-            one.number("contrast", math.nan),
-            one.values.get("levels_estimated") == "true",
-            one.number("height_m", math.nan),
-        )
-    return found
+    stamp_ns, statuses = statuses_from_msg(msg, _WHERE)
+    run = run_of(statuses, _WHERE)
+    reasons = tuple(reason for reason in run.text("reasons").split(_SEPARATOR) if reason)
+    matter = "matter_volume_m3" in run
+    return Measurements(
+        stamp_ns=stamp_ns,
+        newest_ns=run.whole("newest"),
+        run_ns=run.whole("run") if "run" in run else None,
+        final=run.truth("final"),
+        verdict=run.text("verdict", VERDICTS),
+        quality=Quality(run.text("quality", QUALITIES), reasons),
+        arc_rad=run.real("arc_rad"),
+        views_used=run.whole("views"),
+        target=target_of(run, _TARGET) if f"{_TARGET}x_m" in run else None,
+        sign=sign_of(run),
+        objects=tuple(_object_of(number, one) for number, one in numbered(statuses, _OBJECT).items()),
+        grid=_grid_of(run) if "voxel_size_m" in run else None,
+        other_grid=_grid_of(statuses[_OTHER]) if _OTHER in statuses else None,
+        matter_volume_m3=run.real("matter_volume_m3") if matter else None,
+        hollow_volume_m3=run.real("hollow_volume_m3") if matter else None,
+        left_out=left_out_of(statuses),
+    )
+
+
+def _grid_of(status: Status) -> GridFacts:
+    x, y, z = status.reals("origin_x_m", "origin_y_m", "origin_z_m", finite=True)
+    size = status.real("voxel_size_m", finite=True)
+    if not size > 0:
+        raise status.refuse("voxel_size_m", "more than 0 m")
+    seabed = None
+    if "seabed_sigma" in status:
+        gx, gy = status.reals("seabed_gradient_x", "seabed_gradient_y", finite=True)
+        about_x, about_y = status.reals("seabed_about_x_m", "seabed_about_y_m", finite=True)
+        seabed = SeabedSlope((gx, gy), status.real("seabed_sigma"), (about_x, about_y))
+    return GridFacts(status.text("method"), status.real("threshold"), (x, y, z), size, seabed)
+
+
+def _object_of(number: int, status: Status) -> MeasuredObject:
+    if number > LAST_FURTHER:
+        raise AdapterError(f"{_WHERE} has an object {number}; expected at most {LAST_FURTHER}")
+    return MeasuredObject(
+        number, target_of(status, _TARGET), _dimensions_of(status), _grid_of(status), status.whole("views")
+    )
+
+
+def _dimensions_of(status: Status) -> Dimensions:
+    intervals: dict[str, tuple[float, float]] = {}
+    for name, key in _KEYS.items():
+        if f"{key}.low" in status or f"{key}.high" in status:
+            low, high = status.reals(f"{key}.low", f"{key}.high")
+            intervals[name] = low, high
+    x, y = status.reals("x_m", "y_m")
+    plain: Mapping[str, float] = {
+        name: status.real(key) for name, key in _KEYS.items() if not name.startswith("position")
+    }
+    return Dimensions(position_m=(x, y), intervals=intervals, **plain)

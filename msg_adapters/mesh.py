@@ -25,6 +25,7 @@ def marker(
 ) -> Any:
     """Make a Marker with an identity pose unless one is given."""
     defaults: dict[str, Any] = {
+        "id": 0,
         "pose": pose(factory, (0.0, 0.0, 0.0)),
         "scale": point(factory, (1.0, 1.0, 1.0), "geometry_msgs/msg/Vector3"),
     }
@@ -32,7 +33,6 @@ def marker(
         MARKER,
         header=make_header(factory, stamp_ns),
         ns=namespace,
-        id=0,
         type=kind,
         action=action,
         **(defaults | fields),
@@ -102,15 +102,21 @@ def mesh_to_msg(factory: MessageFactory, mesh: trimesh.Trimesh | None, stamp_ns:
     )
 
 
-def mesh_from_msg(msg: Any) -> trimesh.Trimesh | None:
+def mesh_from_msg(msg: Any, where: str = "mesh") -> trimesh.Trimesh | None:
     """Read a mesh (equal corners merged to one vertex); None if the marker takes it away.
+
+    Parameters
+    ----------
+    msg : visualization_msgs/Marker
+        Of either message world.
+    where : str
+        Its topic, for errors.
 
     Raises
     ------
     AdapterError
         If the marker is no triangle list in the scene frame, or its points are no triangles.
     """
-    where = "mesh"
     if not check_marker(msg, TRIANGLE_LIST, "TRIANGLE_LIST", where):
         return None
     n = len(msg.points)

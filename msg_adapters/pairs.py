@@ -155,8 +155,9 @@ def voxel_grid_to_msgs(
         Mean l_out; NaN where unknown. Goes out as rows y (north up), columns x, a channel a height.
     stamp_ns : int
         Stamp, ns.
-    stream_name : {'voxel_grid', 'voxel_views'}
-        What the numbers are: likelihoods, or counts of views.
+    stream_name : str
+        What the numbers are: likelihoods (`voxel_grid`) or counts of views (`voxel_views`), of the target or
+        under a prefix; or what is matter (`matter`, an array of bool).
 
     Raises
     ------
@@ -167,7 +168,11 @@ def voxel_grid_to_msgs(
         raise AdapterError(
             f"{stream_name}/image has {likelihood.shape} voxels; expected {volume.shape} (z, y, x)"
         )
-    pixels = np.ascontiguousarray(likelihood.transpose(1, 2, 0)[::-1], dtype=np.float32)
+    if stream(stream_name).content == "matter":
+        likelihood = np.where(likelihood, np.uint8(255), np.uint8(0))
+    else:
+        likelihood = likelihood.astype(np.float32, copy=False)
+    pixels = np.ascontiguousarray(likelihood.transpose(1, 2, 0)[::-1])
     return (
         image_to_msg(factory, pixels, stamp_ns, stream_name),
         voxel_info_to_msg(factory, volume, stamp_ns),
@@ -176,14 +181,16 @@ def voxel_grid_to_msgs(
 
 def voxel_grid_from_msgs(
     image: Any, info: Any, stream_name: str = "voxel_grid"
-) -> tuple[int, Volume, NDArray[np.float32]]:
-    """Read a dense grid: likelihoods, or counts of views (`voxel_views`).
+) -> tuple[int, Volume, NDArray[Any]]:
+    """Read a dense grid: likelihoods, counts of views (`voxel_views`), or what is matter (`matter`).
 
     Returns
     -------
     stamp_ns : int
     volume : Volume
+        Origin and voxel size to rounding: P holds their quotient. `measurements` holds them exactly.
     likelihood : ndarray of float32, shape (nz, ny, nx)
+        Of `matter`: of bool.
 
     Raises
     ------
@@ -192,7 +199,9 @@ def voxel_grid_from_msgs(
     """
     check_pair(image, info, f"{stream_name}/image")
     pixels = image_from_msg(image, stream_name)
-    stamp_ns, volume = voxel_info_from_msg(info, pixels.shape[2])
+    stamp_ns, volume = voxel_info_from_msg(info, pixels.shape[2], stream_name)
+    if stream(stream_name).content == "matter":
+        pixels = pixels != 0
     return stamp_ns, volume, np.ascontiguousarray(pixels[::-1].transpose(2, 0, 1))
 
 

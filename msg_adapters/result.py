@@ -1,39 +1,45 @@
-"""A run's whole result to and from its topics: the one place that says what is published of it."""
+"""A run's result to and from messages: all that it holds, to the last digit; nothing is computed again.
+
+`measurements` says what there is, so that a message that is left of an earlier result is not taken for one of
+this one; all messages of a result carry one stamp.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from csas_shadow_ros.core.errors import AdapterError
-from csas_shadow_ros.core.seabed import SeabedSlope
 from csas_shadow_ros.core.shape.result import ObjectResult, Result
-from csas_shadow_ros.core.volume import VoxelGrid
+from csas_shadow_ros.core.volume import Volume, VoxelGrid
 
+from .evidence import evidence_from_msg, evidence_to_msg
 from .measurements import (
     GridFacts,
-    Measurements,
-    evidence_from_msg,
-    evidence_to_msg,
+    MeasuredObject,
     measurements_from_msg,
     measurements_to_msg,
+    numbered_objects,
 )
 from .mesh import mesh_from_msg, mesh_to_msg
-from .messages import MessageFactory
+from .messages import MessageFactory, stamp_to_ns
 from .objects import objects_to_msg
 from .pairs import voxel_grid_from_msgs, voxel_grid_to_msgs
 from .search import decision_from_msg
-from .topics import GRID_TOPICS, OTHER_METHOD, prefixed
+from .topics import OTHER_METHOD, PREFIXED_TOPICS, object_prefix, prefixed, stream
 from .voxels import voxels_from_msg, voxels_to_msg
 
+if TYPE_CHECKING:
+    import trimesh
 
-def _object(number: int) -> str:
-    return f"object_{number}"
+#: A voxel of a cloud (float32) lies this close to one of the lattice, in voxels.
+_OFF_LATTICE = 0.1
 
 
-def _any(_: str) -> bool:
+def _all(_: str) -> bool:
     return True
 
 
@@ -41,70 +47,102 @@ def result_to_msgs(
     factory: MessageFactory,
     result: Result,
     *,
-    stamp_ns: int,
-    wanted: Callable[[str], bool] = _any,
+    stamp_ns: int | None = None,
     before: int = 0,
+    wanted: Callable[[str], bool] = _all,
 ) -> Iterator[tuple[str, Any]]:
-    """Turn a result into messages.
+    """Make the messages of a result, each when it is asked for.
 
     Parameters
     ----------
     factory : MessageFactory
-        Makes them.
+        The message world.
     result : Result
-        What was found.
-    stamp_ns : int
-        Their stamp.
-    wanted : callable
-        Says whether anybody wants a topic: large messages for nobody are not made.
+        What the run leaves. Composites, rejected views and timings are not in these messages.
+    stamp_ns : int, optional
+        Stamp of all of them, ns; that of the newest view in it by default.
     before : int
-        How many further objects were published last: those that are gone are taken away.
+        Highest number of an object that was published before: those that are gone are taken away.
+    wanted : callable
+        Whether somebody wants a topic (relative name): grids, voxels and meshes of others are not made.
 
     Yields
     ------
     (str, message)
-        Relative topic and message; `measurements` last, when everything that it tells of is out.
+        The topic, relative to the namespace, and its message. `measurements` comes last.
+
+    Raises
+    ------
+    AdapterError
+        If something in the result has no place in its message.
     """
-    if result.grid is not None:
-        yield from _grid_to_msgs(factory, "", result.grid, stamp_ns, wanted)
-    if result.matter is not None and result.grid is not None and wanted("matter/image"):
-        matter = result.matter.astype(np.float32)
-        image, info = voxel_grid_to_msgs(factory, result.grid.volume, matter, stamp_ns, "matter")
-        yield from (("matter/camera_info", info), ("matter/image", image))
-    bared = None if result.matter_mesh is result.mesh else result.matter_mesh
-    meshes = {"mesh": result.mesh, "matter/mesh": bared}
-    for number, one in enumerate(result.further, start=2):
-        name = _object(number)
-        yield from _grid_to_msgs(factory, name, one.grid, stamp_ns, wanted)
-        meshes[prefixed(name, "mesh")] = one.mesh
+    stamp = result.stamp_ns if stamp_ns is None else stamp_ns
+    mesh = result.mesh
+    yield from _shape(factory, "", result.grid, mesh, stamp, wanted)
+    if result.grid is not None and result.matter is not None:
+        yield from _voxel_stream(factory, "matter", result.grid.volume, result.matter, stamp, wanted)
+    if wanted("matter/mesh"):
+        without_hollows = None if result.matter_mesh is mesh else result.matter_mesh
+        yield "matter/mesh", mesh_to_msg(factory, without_hollows, stamp)
+    objects = numbered_objects(result)
+    further = {number: one for number, one in objects.items() if number > 1}
+    for number, one in further.items():
+        yield from _shape(factory, object_prefix(number), one.grid, one.mesh, stamp, wanted)
+    for number in (n for n in range(2, before + 1) if n not in further):
+        yield from _shape(factory, object_prefix(number), None, None, stamp, wanted)
     if result.other_grid is not None:
-        yield from _grid_to_msgs(factory, OTHER_METHOD, result.other_grid, stamp_ns, wanted)
-    for number in range(len(result.further) + 2, before + 2):
-        meshes[prefixed(_object(number), "mesh")] = None
-    for topic, mesh in meshes.items():
-        # A mesh of ten thousand triangles takes longer to write as a message than to carve from a view.
-        if mesh is None or wanted(topic):
-            yield topic, mesh_to_msg(factory, mesh, stamp_ns)
-    yield "objects", objects_to_msg(factory, result, stamp_ns, before + 1)
-    if wanted("evidence"):
-        yield "evidence", evidence_to_msg(factory, result.evidence, stamp_ns)
-    yield "measurements", measurements_to_msg(factory, result, stamp_ns)
+        yield from _grid(factory, OTHER_METHOD, result.other_grid, stamp, wanted)
+    yield "objects", objects_to_msg(factory, result, before, stamp)
+    yield "evidence", evidence_to_msg(factory, result.evidence, stamp)
+    # Last: it tells what there is, and who has it has everything.
+    yield "measurements", measurements_to_msg(factory, result, stamp)
 
 
-def _grid_to_msgs(
-    factory: MessageFactory, prefix: str, grid: VoxelGrid, stamp_ns: int, wanted: Callable[[str], bool]
+def _shape(
+    factory: MessageFactory,
+    prefix: str,
+    grid: VoxelGrid | None,
+    mesh: trimesh.Trimesh | None,
+    stamp_ns: int,
+    wanted: Callable[[str], bool],
 ) -> Iterator[tuple[str, Any]]:
-    for name, values in (("voxel_grid", grid.likelihood), ("voxel_views", grid.views)):
-        topic = prefixed(prefix, name)
-        if wanted(f"{topic}/image") or wanted(f"{topic}/camera_info"):
-            image, info = voxel_grid_to_msgs(factory, grid.volume, values, stamp_ns, name)
-            yield from ((f"{topic}/camera_info", info), (f"{topic}/image", image))
-    if wanted(prefixed(prefix, "voxels")):
-        yield prefixed(prefix, "voxels"), voxels_to_msg(factory, grid, stamp_ns)
+    yield from _grid(factory, prefix, grid, stamp_ns, wanted)
+    if wanted(topic := prefixed(prefix, "mesh")):
+        yield topic, mesh_to_msg(factory, mesh, stamp_ns)
+
+
+def _grid(
+    factory: MessageFactory,
+    prefix: str,
+    grid: VoxelGrid | None,
+    stamp_ns: int,
+    wanted: Callable[[str], bool],
+) -> Iterator[tuple[str, Any]]:
+    if grid is not None:
+        for name, values in (("voxel_grid", grid.likelihood), ("voxel_views", grid.views)):
+            yield from _voxel_stream(factory, prefixed(prefix, name), grid.volume, values, stamp_ns, wanted)
+    if wanted(topic := prefixed(prefix, "voxels")):
+        yield topic, voxels_to_msg(factory, grid, stamp_ns)
+
+
+def _voxel_stream(
+    factory: MessageFactory,
+    name: str,
+    volume: Volume,
+    values: NDArray[Any],
+    stamp_ns: int,
+    wanted: Callable[[str], bool],
+) -> Iterator[tuple[str, Any]]:
+    kind = stream(name)
+    topics = [topic for topic in (kind.info_topic, kind.image_topic) if wanted(topic)]
+    if topics:
+        picture, info = voxel_grid_to_msgs(factory, volume, values, stamp_ns, name)
+        made = {kind.info_topic: info, kind.image_topic: picture}
+        yield from ((topic, made[topic]) for topic in topics)
 
 
 def topics_of_result(measurements: Any) -> list[str]:
-    """Return the topics of the result that a message of `measurements` speaks of.
+    """Return the topics of the result that a message of `measurements` speaks of: what it is rebuilt from.
 
     Raises
     ------
@@ -112,37 +150,44 @@ def topics_of_result(measurements: Any) -> list[str]:
         See `measurements_from_msg`.
     """
     told = measurements_from_msg(measurements)
-    topics = ["measurements", "objects", "mesh", "evidence"]
-    if told.main is not None:
-        topics += [t for t in GRID_TOPICS if t != "mesh"]
-    if told.hollow is not None:
-        topics += ["matter/camera_info", "matter/image", "matter/mesh"]
-    if told.other is not None:
-        topics += [prefixed(OTHER_METHOD, t) for t in GRID_TOPICS if t != "mesh"]
-    for number in range(2, 2 + len(told.objects) - _main_is_object(told)):
-        topics += [prefixed(_object(number), t) for t in GRID_TOPICS]
+    grid = [topic for topic in PREFIXED_TOPICS if topic != "mesh"]
+    topics = ["measurements", "objects", "evidence"]
+    if told.grid is not None:
+        topics += [*grid, "mesh"]
+        if told.matter_volume_m3 is not None:
+            topics += ["matter/camera_info", "matter/image", "matter/mesh"]
+    if told.other_grid is not None:
+        topics += [prefixed(OTHER_METHOD, topic) for topic in grid]
+    for one in told.objects:
+        if one.number > 1:
+            topics += [prefixed(object_prefix(one.number), topic) for topic in (*grid, "mesh")]
     return topics
 
 
-def _main_is_object(told: Measurements) -> bool:
-    """Say whether the first object is the target: its grid is that of the topics without a prefix."""
-    return bool(told.objects) and told.main is not None and told.objects[0].grid == told.main
-
-
 def result_from_msgs(messages: Mapping[str, Any]) -> Result:
-    """Put a result together from its messages, by relative topic: nothing is computed.
+    """Rebuild a result from its messages, to the last digit.
 
-    What no message tells is empty: `sides`, `looks`, `composites`, `rejected` and `timings_s`.
+    Composites, rejected views and timings are not among them, and stay empty. Vertices of a mesh come in
+    another order: a marker holds triangles.
+
+    Parameters
+    ----------
+    messages : mapping of str to message
+        By topic, relative to the namespace; of either message world. Others than a result's are passed over,
+        and so are those of a result's topics that `measurements` does not tell of.
 
     Raises
     ------
     AdapterError
-        If a message is missing, breaks the contract, or contradicts another.
+        If one is missing, breaks the contract, or carries another stamp than `measurements`.
     """
     told = measurements_from_msg(_message(messages, "measurements"))
+    reader = _Reader(messages, told.stamp_ns)
+    objects = {one.number: one for one in told.objects}
+    main = objects.pop(1, None)
     result = Result(
         run_ns=told.run_ns,
-        stamp_ns=told.stamp_ns,
+        stamp_ns=told.newest_ns,
         final=told.final,
         verdict=told.verdict,
         quality=told.quality,
@@ -150,61 +195,117 @@ def result_from_msgs(messages: Mapping[str, Any]) -> Result:
         sign=told.sign,
         views_used=told.views_used,
         arc_rad=told.arc_rad,
+        evidence=evidence_from_msg(reader.stamped("evidence")),
+        further=[reader.object(one) for one in objects.values()],
         left_out=list(told.left_out),
     )
     if "search" in messages:
         result.decision = decision_from_msg(messages["search"]).decision
-    if "evidence" in messages:
-        result.evidence = evidence_from_msg(messages["evidence"])
-    if told.main is not None:
-        result.grid = _grid_from_msgs(messages, "", told.main, told.slope)
-    if told.other is not None:
-        result.other_grid = _grid_from_msgs(messages, OTHER_METHOD, told.other)
-    main = _main_is_object(told)
-    if main:
-        result.mesh = mesh_from_msg(_message(messages, "mesh"))
-        result.dimensions = told.objects[0].dimensions
-    if told.hollow is not None and result.grid is not None:
-        image, info = _message(messages, "matter/image"), _message(messages, "matter/camera_info")
-        result.matter = voxel_grid_from_msgs(image, info, "matter")[2] > 0.5
-        result.matter_mesh = mesh_from_msg(_message(messages, "matter/mesh")) if told.hollow else result.mesh
-    for number, one in enumerate(told.objects[1:] if main else told.objects, start=2):
-        prefix = _object(number)
-        grid = _grid_from_msgs(messages, prefix, one.grid)
-        mesh = mesh_from_msg(_message(messages, prefixed(prefix, "mesh")))
-        if mesh is None:
-            raise AdapterError(
-                f"{prefixed(prefix, 'mesh')} takes the surface away; measurements tell of an object"
-            )
-        result.further.append(ObjectResult(one.target, grid, mesh, one.dimensions, one.grid.views))
+    if numbers := [n for i, n in enumerate(objects, start=2) if n != i]:
+        raise AdapterError(
+            f"measurements has an object {numbers[0]} after {numbers[0] - 2 or 'no'} others;"
+            " expected further objects to be numbered 2, 3, ..."
+        )
+    if told.grid is not None:
+        result.grid = reader.grid("", told.grid)
+        result.mesh = reader.surface("mesh") if main is None else reader.mesh("")
+        if told.matter_volume_m3 is not None:
+            result.matter = reader.matter(told.grid)
+            without_hollows = reader.surface("matter/mesh")
+            result.matter_mesh = result.mesh if without_hollows is None else without_hollows
+    if main is not None:
+        if result.grid is None:
+            raise AdapterError("measurements has an object 1, but its run no grid; expected both or neither")
+        result.dimensions = main.dimensions
+    if told.other_grid is not None:
+        result.other_grid = reader.grid(OTHER_METHOD, told.other_grid)
     return result
 
 
 def _message(messages: Mapping[str, Any], topic: str) -> Any:
-    try:
-        return messages[topic]
-    except KeyError:
-        raise AdapterError(f"no message of {topic} is there; measurements tell of one") from None
+    if topic not in messages:
+        raise AdapterError(f"there is no message of {topic}; expected one to rebuild the result from")
+    return messages[topic]
 
 
-def _grid_from_msgs(
-    messages: Mapping[str, Any], prefix: str, facts: GridFacts, slope: SeabedSlope | None = None
-) -> VoxelGrid:
-    """Put a grid together: its lattice to the last digit from `facts`, its object's voxels from `voxels`."""
-    volume = facts.volume
-    values = {}
-    for name in ("voxel_grid", "voxel_views"):
-        topic = prefixed(prefix, name)
-        image, info = _message(messages, f"{topic}/image"), _message(messages, f"{topic}/camera_info")
-        _, own, values[name] = voxel_grid_from_msgs(image, info, name)
-        off = np.abs(np.subtract(own.origin_m, volume.origin_m)).max()
-        if own.shape != volume.shape or off > 1e-3 * volume.voxel_size_m:
-            raise AdapterError(f"{topic}/camera_info has the lattice {own}; measurements say {volume}")
-    cloud = voxels_from_msg(_message(messages, prefixed(prefix, "voxels")))
-    at = np.rint((cloud.points_m - np.asarray(volume.origin_m)) / volume.voxel_size_m).astype(np.intp)
-    if len(at) and (at.min() < 0 or (at.max(axis=0) >= volume.shape[::-1]).any()):
-        raise AdapterError(f"{prefixed(prefix, 'voxels')} lie outside of the lattice {volume}")
-    occupied = np.zeros(volume.shape, bool)
-    occupied[at[:, 2], at[:, 1], at[:, 0]] = True
-    views = values["voxel_views"].astype(np.uint16)
-    return VoxelGrid(volume, values["voxel_grid"], views, facts.threshold, occupied, facts.method, slope)
+class _Reader:
+    """Takes a result's parts out of messages of one stamp."""
+
+    def __init__(self, messages: Mapping[str, Any], stamp_ns: int) -> None:
+        self._messages = messages
+        self._stamp_ns = stamp_ns
+
+    def stamped(self, topic: str) -> Any:
+        message = _message(self._messages, topic)
+        stamp = stamp_to_ns(message.header.stamp, f"{topic}.header.stamp")
+        if stamp != self._stamp_ns:
+            raise AdapterError(
+                f"{topic} is stamped {stamp} ns; expected the stamp of measurements, {self._stamp_ns} ns"
+            )
+        return message
+
+    def values(self, name: str, facts: GridFacts) -> tuple[Volume, NDArray[Any]]:
+        """Read an image of voxels on the exact lattice."""
+        kind = stream(name)
+        image, info = self.stamped(kind.image_topic), self.stamped(kind.info_topic)
+        _, volume, values = voxel_grid_from_msgs(image, info, name)
+        d = facts.voxel_size_m
+        differences = np.subtract(volume.origin_m, facts.origin_m)
+        if abs(volume.voxel_size_m - d) > 1e-6 * d or np.abs(differences).max() > 1e-3 * d:
+            raise AdapterError(
+                f"{kind.info_topic} has voxels of {volume.voxel_size_m:g} m from {volume.origin_m};"
+                f" expected those of measurements, {d:g} m from {facts.origin_m}"
+            )
+        return Volume(facts.origin_m, d, volume.shape), values
+
+    def grid(self, prefix: str, facts: GridFacts) -> VoxelGrid:
+        volume, likelihood = self.values(prefixed(prefix, "voxel_grid"), facts)
+        name = prefixed(prefix, "voxel_views")
+        of_views, views = self.values(name, facts)
+        if of_views != volume:
+            raise AdapterError(f"{name} has {of_views.shape} voxels (z, y, x); expected {volume.shape}")
+        if views.max() > np.iinfo(np.uint16).max or (views != np.rint(views)).any():
+            raise AdapterError(f"{name} has up to {views.max():g} views; expected whole numbers below 65536")
+        occupied = self.occupied(prefixed(prefix, "voxels"), volume)
+        return VoxelGrid(
+            volume, likelihood, views.astype(np.uint16), facts.threshold, occupied, facts.method, facts.seabed
+        )
+
+    def occupied(self, topic: str, volume: Volume) -> NDArray[np.bool_]:
+        """Mark the voxels of a cloud on the lattice."""
+        points = voxels_from_msg(self.stamped(topic), topic).points_m.astype(np.float64)
+        places = (points - volume.origin_m) / volume.voxel_size_m
+        index = np.rint(places).astype(np.int64)
+        size = np.array(volume.shape[::-1])
+        bad = (np.abs(places - index) > _OFF_LATTICE).any(axis=1) | ((index < 0) | (index >= size)).any(
+            axis=1
+        )
+        if bad.any():
+            first = int(bad.argmax())
+            raise AdapterError(
+                f"{topic} has {int(bad.sum())} of {len(points)} points off the lattice, the first at {first}"
+                f" ({points[first].tolist()}); expected centres of the grid's voxels"
+            )
+        occupied = np.zeros(volume.shape, bool)
+        occupied[tuple(index.T[::-1])] = True
+        return occupied
+
+    def matter(self, facts: GridFacts) -> NDArray[np.bool_]:
+        return self.values("matter", facts)[1].astype(bool, copy=False)
+
+    def mesh(self, prefix: str) -> trimesh.Trimesh:
+        """Read an object's surface; an empty one where the marker takes it away."""
+        found = self.surface(prefixed(prefix, "mesh"))
+        if found is None:
+            import trimesh  # late: as in mesh_from_msg
+
+            return trimesh.Trimesh()
+        return found
+
+    def surface(self, topic: str) -> trimesh.Trimesh | None:
+        return mesh_from_msg(self.stamped(topic), topic)
+
+    def object(self, one: MeasuredObject) -> ObjectResult:
+        prefix = object_prefix(one.number)
+        mesh = self.mesh(prefix)
+        return ObjectResult(one.target, self.grid(prefix, one.grid), mesh, one.dimensions, one.views_used)

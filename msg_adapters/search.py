@@ -1,111 +1,57 @@
-"""diagnostic_msgs/DiagnosticArray to and from what is to be carved: topic `search`."""
+"""diagnostic_msgs/DiagnosticArray to and from what is to be carved."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
-
-from csas_shadow_ros.core.errors import AdapterError
-from csas_shadow_ros.core.search.decision import Decision
-from csas_shadow_ros.core.shape.result import LeftOut
-from csas_shadow_ros.core.target import SignEvidence
-from csas_shadow_ros.core.volume import Target
+from typing import TYPE_CHECKING, Any
 
 from .messages import MessageFactory
-from .values import Status, numbered, statuses_from_msg, statuses_to_msg, value_texts
+from .statuses import (
+    RUN,
+    Status,
+    Value,
+    left_out_of,
+    left_out_statuses,
+    numbered,
+    run_of,
+    sign_of,
+    sign_values,
+    statuses_from_msg,
+    statuses_to_msg,
+    target_of,
+    target_values,
+)
+
+if TYPE_CHECKING:
+    from csas_shadow_ros.core.search.decision import Decision
+
+_WHERE = "search"
+_BODY = "body"
 
 
 @dataclass(frozen=True)
-class SearchMessage:
-    """What topic `search` says.
+class SearchNews:
+    """A decision, and what it is about.
 
     Parameters
     ----------
+    stamp_ns : int
+        Stamp of the message, ns.
     decision : Decision
         What is to be carved.
     run_ns : int or None
-        The run's name: the stamp of its track's first pose.
+        The run's name: the stamp of its track's first pose; None where there is no track.
     target_stamp_ns : int
-        Stamp of the `target` marker that goes with it.
+        Stamp of the marker on `target` that says the same.
     may_move : bool
         The run is still going on: another decision may follow, and replaces this one.
     """
 
+    stamp_ns: int
     decision: Decision
     run_ns: int | None
     target_stamp_ns: int
-    may_move: bool
-
-
-def target_values(target: Target, prefix: str = "") -> dict[str, Any]:
-    """Return the values that tell a body's volume."""
-    names = ("x_m", "y_m", "size_x_m", "size_y_m", "size_z_m")
-    numbers = (*target.position_m, *target.size_m)
-    own: dict[str, Any] = {name: float(value) for name, value in zip(names, numbers, strict=True)}
-    own |= {"evidence": float(target.evidence), "stands": bool(target.stands)}
-    return {f"{prefix}{name}": value for name, value in own.items()}
-
-
-def target_of_values(status: Status, prefix: str = "") -> Target:
-    """Read what `target_values` wrote.
-
-    Raises
-    ------
-    AdapterError
-        If a value is missing or a size is not positive.
-    """
-    x, y, *size = (
-        status.number(f"{prefix}{name}") for name in ("x_m", "y_m", "size_x_m", "size_y_m", "size_z_m")
-    )
-    if not min(size) > 0:
-        raise AdapterError(
-            f"{status.where} status {status.name!r}: size is {tuple(size)}; expected x, y, z > 0 m"
-        )
-    stands = status.values.get(f"{prefix}stands", "true") == "true"
-    evidence = status.number(f"{prefix}evidence", float("nan"))
-    return Target((x, y), (size[0], size[1], size[2]), evidence, stands)
-
-
-def sign_values(sign: SignEvidence | None) -> dict[str, Any]:
-    """Return the values that tell how the spectrum's sign fits."""
-    if sign is None:
-        return {}
-    return {
-        "spectrum_sign": sign.stated,
-        "spectrum_sign.verdict": sign.verdict,
-        "spectrum_sign.stated_evidence": float(sign.stated_evidence),
-        "spectrum_sign.other_evidence": float(sign.other_evidence),
-    }
-
-
-def sign_of_values(status: Status) -> SignEvidence | None:
-    """Read what `sign_values` wrote."""
-    if "spectrum_sign" not in status.values:
-        return None
-    return SignEvidence(
-        status.whole("spectrum_sign"),
-        status.number("spectrum_sign.stated_evidence"),
-        status.number("spectrum_sign.other_evidence"),
-    )
-
-
-def left_out_statuses(left_out: Any) -> list[Status]:
-    """Return a status for each body that is no object, or is not carved."""
-    return [
-        Status(
-            f"left out {number}",
-            one.reason,
-            value_texts({"x_m": float(one.position_m[0]), "y_m": float(one.position_m[1])}),
-        )
-        for number, one in enumerate(left_out, start=1)
-    ]
-
-
-def left_out_of(statuses: dict[str, Status]) -> list[LeftOut]:
-    """Read what `left_out_statuses` wrote."""
-    return [
-        LeftOut((one.number("x_m"), one.number("y_m")), one.message) for one in numbered(statuses, "left out")
-    ]
+    may_move: bool = False
 
 
 def decision_to_msg(
@@ -114,48 +60,52 @@ def decision_to_msg(
     stamp_ns: int,
     run_ns: int | None,
     target_stamp_ns: int,
-    *,
     may_move: bool = False,
 ) -> Any:
-    """Make the message of topic `search`.
+    """Make the DiagnosticArray of a decision: a status of the run, one a body, one a body left out.
 
     Parameters
     ----------
     factory : MessageFactory
-        Makes the message.
+        The message world.
     decision : Decision
         What is to be carved.
     stamp_ns : int
-        Stamp.
+        Stamp, ns.
     run_ns, target_stamp_ns, may_move
-        See `SearchMessage`.
-    """
-    bodies = [] if decision.target is None else [decision.target, *decision.others]
-    found = f"{len(bodies)} to carve, {len(decision.left_out)} left out" if bodies else "no object"
-    run = {"run": run_ns, "target": target_stamp_ns, "may_move": may_move, **sign_values(decision.sign)}
-    statuses = [Status("run", found, value_texts(run))]
-    statuses += [
-        Status(f"body {number}", "to be carved", value_texts(target_values(body)))
-        for number, body in enumerate(bodies, start=1)
-    ]
-    return statuses_to_msg(factory, stamp_ns, [*statuses, *left_out_statuses(decision.left_out)])
-
-
-def decision_from_msg(msg: Any) -> SearchMessage:
-    """Read the message of topic `search`.
+        See `SearchNews`.
 
     Raises
     ------
     AdapterError
-        If a status or a value is missing or wrong.
+        If the stamp is no ROS time.
     """
-    statuses = statuses_from_msg(msg, "search")
-    run = statuses.get("run")
-    if run is None:
-        raise AdapterError(f"search has statuses {sorted(statuses)}; expected one named 'run'")
-    bodies = [target_of_values(one) for one in numbered(statuses, "body")]
-    decision = Decision(
-        bodies[0] if bodies else None, tuple(bodies[1:]), tuple(left_out_of(statuses)), sign_of_values(run)
-    )
-    name = run.whole("run", 0) if "run" in run.values else None
-    return SearchMessage(decision, name, run.whole("target"), run.values.get("may_move") == "true")
+    values: dict[str, Value] = {} if run_ns is None else {"run": int(run_ns)}
+    values |= {"target": int(target_stamp_ns), "may_move": bool(may_move)} | sign_values(decision.sign)
+    # The target is body 1; where there is none, that number stays free.
+    bodies = dict(enumerate(decision.others, start=2))
+    if decision.target is not None:
+        bodies = {1: decision.target} | bodies
+    said = f"{len(bodies)} to carve, {len(decision.left_out)} left out"
+    statuses = [Status.of(RUN, values, said)]
+    statuses += [Status.of(f"{_BODY} {number}", target_values(body)) for number, body in bodies.items()]
+    return statuses_to_msg(factory, stamp_ns, [*statuses, *left_out_statuses(decision.left_out)])
+
+
+def decision_from_msg(msg: Any) -> SearchNews:
+    """Read a decision, to the last digit.
+
+    Raises
+    ------
+    AdapterError
+        Naming the status and the value that are missing or not what they must be.
+    """
+    from csas_shadow_ros.core.search.decision import Decision  # late, as in sign_of
+
+    stamp_ns, statuses = statuses_from_msg(msg, _WHERE)
+    run = run_of(statuses, _WHERE)
+    bodies = {number: target_of(status) for number, status in numbered(statuses, _BODY).items()}
+    target = bodies.pop(1, None)
+    decision = Decision(target, tuple(bodies.values()), left_out_of(statuses), sign_of(run))
+    run_ns = run.whole("run") if "run" in run else None
+    return SearchNews(stamp_ns, decision, run_ns, run.whole("target"), run.truth("may_move"))

@@ -3,6 +3,10 @@
 Names are relative to the namespace `NAMESPACE`; `absolute_name` joins the two. An `ImageStream` is
 a pair of topics, ``<stream>/image`` and ``<stream>/camera_info`` (no prefix for the full-circle
 image), whose messages belong together by their stamps.
+
+What a run publishes of its target exists for further objects and for the other method's grid, too, under a
+prefix: ``object_2/voxel_grid/image``, ``other_method/voxels``. `TOPICS` and `STREAMS` hold names without a
+prefix; `topic` and `stream` take both kinds.
 """
 
 from __future__ import annotations
@@ -28,6 +32,8 @@ COMPLEX_ENCODINGS = ("32FC2", "8SC2", "16SC2", "64FC2")
 
 #: 32FC1, 32FC2, 32FC3 ...: one float channel a height.
 VOXEL_ENCODING = "32FCn"
+#: 8UC1, 8UC2 ...: one byte channel a height.
+MATTER_ENCODING = "8UCn"
 
 CSAS_IMAGE = "csas_image"
 CSAS_SECTOR = "csas_sector"
@@ -35,7 +41,7 @@ CSAS_SUB_APERTURE = "csas_sub_aperture"
 CSAS_SHADOW = "csas_shadow"
 CSAS_VOXEL_GRID = "csas_voxel_grid"
 
-Content = Literal["coherent", "sub_aperture", "amplitude", "likelihood", "mask", "picture", "count"]
+Content = Literal["coherent", "sub_aperture", "amplitude", "likelihood", "mask", "picture", "count", "matter"]
 
 _ACOUSTICS = ("centre frequency (Hz)", "bandwidth (Hz)", "sound speed (m/s)", "spectrum_sign (+1 or -1)")
 _APERTURE = (
@@ -173,16 +179,18 @@ STREAMS: dict[str, ImageStream] = {
         ),
         ImageStream(
             "matter",
-            (VOXEL_ENCODING,),
+            (MATTER_ENCODING,),
             CSAS_VOXEL_GRID,
-            "count",
-            "1 where the object holds matter, 0 elsewhere and in hollows, on the lattice of voxel_grid",
+            "matter",
+            "which voxels hold matter: 255, others 0; the object without its hollows, on the same lattice",
         ),
     )
 }
 
 #: Streams whose images are views (a view frame and a sonar).
 VIEW_STREAMS = ("sub_aperture", "shadow", "likelihood", "shadow_mask")
+#: Streams whose images are voxels: a channel a height.
+VOXEL_STREAMS = tuple(s.name for s in STREAMS.values() if s.distortion_model == CSAS_VOXEL_GRID)
 
 
 def _topics() -> dict[str, Topic]:
@@ -202,11 +210,15 @@ def _topics() -> dict[str, Topic]:
         Topic("target", MARKER, "the carved volume as a CUBE; action DELETE: no object"),
         Topic("voxels", POINT_CLOUD, "voxels that may be object: x y z l_out views"),
         Topic("mesh", MARKER, "TRIANGLE_LIST of the thresholded surface; action DELETE: no object"),
-        Topic("matter/mesh", MARKER, "TRIANGLE_LIST of the surface without hollows; action DELETE: none"),
-        Topic("objects", MARKERS, "an oriented CUBE and a TEXT an object; action DELETE for what is gone"),
-        Topic("measurements", DIAGNOSTICS, "each object and the run: values, intervals, verdict"),
-        Topic("evidence", DIAGNOSTICS, "a status a view in the grid: levels, and the height it tells"),
-        Topic("search", DIAGNOSTICS, "what is carved: the target, further bodies, and what was left out"),
+        Topic(
+            "matter/mesh",
+            MARKER,
+            "TRIANGLE_LIST of the surface without hollows; action DELETE: mesh is that surface",
+        ),
+        Topic("objects", MARKERS, "each object as an oriented CUBE and a label; DELETE: gone"),
+        Topic("measurements", DIAGNOSTICS, "measures of each object, verdict and quality of the run"),
+        Topic("evidence", DIAGNOSTICS, "what each view contributed to the grid: one status a view"),
+        Topic("search", DIAGNOSTICS, "what is to be carved, and what is left out and why"),
         Topic("progress", DIAGNOSTICS, "what became of each view, and the nodes' heartbeats"),
         Topic("/diagnostics", DIAGNOSTICS, "views in, out, rejected and why, rates"),
     ]
@@ -217,89 +229,131 @@ def _topics() -> dict[str, Topic]:
 TOPICS: dict[str, Topic] = _topics()
 
 
-#: Topics of a grid, which further objects and the other method have too, each under its prefix.
-GRID_TOPICS = (
-    *(f"{s}/{part}" for s in ("voxel_grid", "voxel_views") for part in ("camera_info", "image")),
+#: Of the other method's grid.
+OTHER_METHOD = "other_method"
+#: Numbers that a further object can have; the target is number 1 and has no prefix.
+FIRST_FURTHER, LAST_FURTHER = 2, 64
+#: Streams, and other topics, that exist under a prefix too.
+PREFIXED_STREAMS = ("voxel_grid", "voxel_views")
+PREFIXED_TOPICS = (
+    *(t for s in PREFIXED_STREAMS for t in (STREAMS[s].image_topic, STREAMS[s].info_topic)),
     "voxels",
     "mesh",
 )
-#: Topics of a run's result, without those of further objects.
-RESULT_TOPICS = (
-    *GRID_TOPICS,
-    "matter/camera_info",
-    "matter/image",
-    "matter/mesh",
-    "objects",
-    "measurements",
-    "evidence",
-)
-#: Prefix of the grid by the other method.
-OTHER_METHOD = "other_method"
-_PREFIX = re.compile(rf"(object_(?:[2-9]|[1-5]\d|6[0-4])|{OTHER_METHOD})/(.+)")
-#: Topics whose last message holds until another one comes.
-_LATCHED = frozenset(
-    {"image", "camera_info", "track", "target", "search", *RESULT_TOPICS}
-    | {f"{s}/{part}" for s in ("multilook", "color_by_aspect") for part in ("camera_info", "image")}
+_PREFIX = re.compile(rf"({OTHER_METHOD}|object_[1-9]\d?)/(.+)")
+
+_LATCHED_STREAMS = ("image", "multilook", "color_by_aspect", *VOXEL_STREAMS)
+#: Topics whose last message stays: whoever comes late gets it. Names without a prefix.
+LATCHED: frozenset[str] = frozenset(
+    {"track", "target", "voxels", "mesh", "matter/mesh", "objects", "measurements", "evidence", "search"}
+    | {t for s in _LATCHED_STREAMS for t in (STREAMS[s].image_topic, STREAMS[s].info_topic)}
 )
 
 
-def prefixed(prefix: str, name: str) -> str:
-    """Return the name of a grid's topic under a prefix (``object_2``), or as it is under none."""
-    return f"{prefix}/{name}" if prefix else name
+def object_prefix(number: int) -> str:
+    """Return the prefix of an object's topics: '' for the target, number 1.
+
+    Raises
+    ------
+    AdapterError
+        If no object can have that number.
+    """
+    if not 1 <= number <= LAST_FURTHER:
+        raise AdapterError(f"object number is {number}; expected 1 to {LAST_FURTHER}")
+    return "" if number == 1 else f"object_{number}"
 
 
 def split_prefix(name: str) -> tuple[str, str]:
-    """Split a topic, or stream, into its prefix (``object_2``, ``other_method`` or none) and the rest.
+    """Split a topic's or a stream's name into its prefix ('' if it has none) and the rest.
 
-    Examples
-    --------
-    >>> split_prefix("object_2/voxel_grid/image")
-    ('object_2', 'voxel_grid/image')
-    >>> split_prefix("voxels")
-    ('', 'voxels')
+    A prefix that the contract does not know is none: ``object_1/mesh`` stays as it is.
     """
     match = _PREFIX.fullmatch(name)
-    if match and any(t == match.group(2) or t.startswith(f"{match.group(2)}/") for t in GRID_TOPICS):
-        return match.group(1), match.group(2)
-    return "", name
+    return (match[1], match[2]) if match and _is_prefix(match[1]) else ("", name)
+
+
+def _is_prefix(prefix: str) -> bool:
+    if prefix == OTHER_METHOD:
+        return True
+    word, _, number = prefix.partition("_")
+    return word == "object" and number.isdecimal() and FIRST_FURTHER <= int(number) <= LAST_FURTHER
+
+
+#: Topics of a run's result, without those of further objects and of the other method.
+RESULT_TOPICS = (*PREFIXED_TOPICS, "matter/camera_info", "matter/image", "matter/mesh")
+RESULT_TOPICS += ("objects", "evidence", "measurements")
+
+
+def prefixed(prefix: str, name: str) -> str:
+    """Put a prefix before a topic's or a stream's name; '' leaves it as it is.
+
+    Raises
+    ------
+    AdapterError
+        If there is no such prefix, or the name does not exist under one.
+    """
+    if not prefix:
+        return name
+    if not _is_prefix(prefix):
+        raise AdapterError(
+            f"prefix is {prefix!r}; expected object_{FIRST_FURTHER} to object_{LAST_FURTHER},"
+            f" or {OTHER_METHOD}"
+        )
+    if name not in (*PREFIXED_TOPICS, *PREFIXED_STREAMS):
+        raise AdapterError(
+            f"{name!r} does not exist under {prefix}; expected one of: {', '.join(PREFIXED_TOPICS)}"
+        )
+    return f"{prefix}/{name}"
 
 
 def topic(name: str) -> Topic:
-    """Return a topic of the contract by its relative name, with or without a prefix.
+    """Return the topic of that name, relative to the namespace, with or without a prefix.
 
     Raises
     ------
     AdapterError
         If there is none.
     """
-    found = TOPICS.get(split_prefix(name)[1])
-    if found is None:
-        raise AdapterError(f"there is no topic {name!r}; expected one of: {', '.join(TOPICS)}")
-    return replace(found, name=name)
+    prefix, rest = split_prefix(name)
+    if rest not in (PREFIXED_TOPICS if prefix else TOPICS):
+        raise AdapterError(
+            f"there is no topic {name!r}; expected one of: {', '.join(TOPICS)};"
+            f" or, under object_N or {OTHER_METHOD}, one of: {', '.join(PREFIXED_TOPICS)}"
+        )
+    found = TOPICS[rest]
+    if not prefix:
+        return found
+    whose = "the other method" if prefix == OTHER_METHOD else prefix.replace("_", " ")
+    return replace(found, name=name, description=f"{found.description}; of {whose}")
 
 
 def is_topic(name: str) -> bool:
-    """Say whether the contract has a topic of that relative name."""
-    return split_prefix(name)[1] in TOPICS
+    """Say whether the contract has a topic of that relative name, with or without a prefix."""
+    prefix, rest = split_prefix(name)
+    return rest in (PREFIXED_TOPICS if prefix else TOPICS)
 
 
 def is_latched(name: str) -> bool:
-    """Say whether the last message of a topic holds until another one comes."""
-    return split_prefix(name)[1] in _LATCHED
+    """Say whether a topic's last message stays for whoever comes late (a relative name)."""
+    prefix, rest = split_prefix(name)
+    return rest in LATCHED and (not prefix or rest in PREFIXED_TOPICS)
 
 
 def stream(name: str) -> ImageStream:
-    """Return the image stream of that name, with or without a prefix.
+    """Return the image stream of that name, with or without a prefix (``object_2/voxel_grid``).
 
     Raises
     ------
     AdapterError
         If there is none.
     """
-    found = STREAMS.get(split_prefix(name)[1])
-    if found is None:
-        raise AdapterError(f"there is no image stream {name!r}; expected one of: {', '.join(STREAMS)}")
-    return found if found.name == name else replace(found, name=name)
+    prefix, rest = split_prefix(name)
+    if rest not in (PREFIXED_STREAMS if prefix else STREAMS):
+        raise AdapterError(
+            f"there is no image stream {name!r}; expected one of: {', '.join(STREAMS)};"
+            f" or, under object_N or {OTHER_METHOD}, one of: {', '.join(PREFIXED_STREAMS)}"
+        )
+    return replace(STREAMS[rest], name=name) if prefix else STREAMS[rest]
 
 
 def absolute_name(name: str, namespace: str = NAMESPACE) -> str:
@@ -316,11 +370,15 @@ def clean_namespace(namespace: str) -> str:
 def topic_table() -> str:
     """Write the contract's topics as a markdown table, for the README."""
     lines = ["| topic | type | encoding or kind | holds |", "|---|---|---|---|"]
-    for topic in TOPICS.values():
-        package, _, name = topic.type_name.split("/")
-        kind = ", ".join(topic.encodings or topic.distortion_models)
-        lines.append(f"| `{topic.name}` | {package}/{name} | {kind} | {topic.description} |")
-    grid = "`voxel_grid/*`, `voxel_views/*`, `voxels`, `mesh`"
-    lines.append(f"| `object_N/…` | as without prefix | | {grid} of objects 2, 3, … |")
-    lines.append(f"| `{OTHER_METHOD}/…` | as without prefix | | {grid} by the other method, if asked for |")
+    for one in TOPICS.values():
+        package, _, name = one.type_name.split("/")
+        kind = ", ".join(one.encodings or one.distortion_models)
+        lines.append(f"| `{one.name}` | {package}/{name} | {kind} | {one.description} |")
+    sets = (*(f"{s}/*" for s in PREFIXED_STREAMS), "voxels", "mesh")
+    for prefix, holds in (
+        ("object_N", f"of further objects, N from {FIRST_FURTHER} to {LAST_FURTHER}"),
+        (OTHER_METHOD, "of the grid by the other method, where it is asked for"),
+    ):
+        names = ", ".join(f"`{prefix}/{name}`" for name in sets)
+        lines.append(f"| {names} | as without prefix | as without prefix | {holds} |")
     return "\n".join(lines) + "\n"

@@ -51,7 +51,7 @@ class Voxels:
 
 
 def voxels_to_msg(
-    factory: MessageFactory, grid: VoxelGrid, stamp_ns: int, where: NDArray[np.bool_] | None = None
+    factory: MessageFactory, grid: VoxelGrid | None, stamp_ns: int, where: NDArray[np.bool_] | None = None
 ) -> Any:
     """Make the cloud of a grid's voxels that may be object.
 
@@ -59,8 +59,8 @@ def voxels_to_msg(
     ----------
     factory : MessageFactory
         The message world.
-    grid : VoxelGrid
-        The grid.
+    grid : VoxelGrid or None
+        The grid; None: no voxels.
     stamp_ns : int
         Stamp, ns.
     where : ndarray of bool, shape (nz, ny, nx), optional
@@ -71,14 +71,7 @@ def voxels_to_msg(
     AdapterError
         If `where` is not the grid's shape.
     """
-    chosen = grid.occupied if where is None else where
-    if chosen.shape != grid.volume.shape:
-        raise AdapterError(f"voxels: choice has shape {chosen.shape}; expected {grid.volume.shape} (z, y, x)")
-    iz, iy, ix = np.nonzero(chosen)
-    points = np.zeros(iz.size, _POINT)
-    points["x"], points["y"], points["z"] = grid.volume.x_m[ix], grid.volume.y_m[iy], grid.volume.z_m[iz]
-    points["l_out"] = grid.likelihood[iz, iy, ix]
-    points["views"] = grid.views[iz, iy, ix]
+    points = np.zeros(0, _POINT) if grid is None else _points(grid, grid.occupied if where is None else where)
     fields = [
         factory.make(
             "sensor_msgs/msg/PointField",
@@ -103,8 +96,26 @@ def voxels_to_msg(
     )
 
 
-def voxels_from_msg(msg: Any) -> Voxels:
+def _points(grid: VoxelGrid, chosen: NDArray[np.bool_]) -> NDArray[Any]:
+    if chosen.shape != grid.volume.shape:
+        raise AdapterError(f"voxels: choice has shape {chosen.shape}; expected {grid.volume.shape} (z, y, x)")
+    iz, iy, ix = np.nonzero(chosen)
+    points = np.zeros(iz.size, _POINT)
+    points["x"], points["y"], points["z"] = grid.volume.x_m[ix], grid.volume.y_m[iy], grid.volume.z_m[iz]
+    points["l_out"] = grid.likelihood[iz, iy, ix]
+    points["views"] = grid.views[iz, iy, ix]
+    return points
+
+
+def voxels_from_msg(msg: Any, where: str = "voxels") -> Voxels:
     """Read a cloud of voxels; other fields than x, y, z, l_out and views are passed over.
+
+    Parameters
+    ----------
+    msg : sensor_msgs/PointCloud2
+        Of either message world.
+    where : str
+        Its topic, for errors.
 
     Raises
     ------
@@ -112,7 +123,6 @@ def voxels_from_msg(msg: Any) -> Voxels:
         If a field is missing, of another type or outside its point, the sizes contradict each other,
         or a position is not finite.
     """
-    where = "voxels"
     check_type(msg, POINT_CLOUD, where)
     check_frame(msg, where)
     step, rows, cols = int(msg.point_step), int(msg.height), int(msg.width)

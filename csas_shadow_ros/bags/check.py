@@ -22,7 +22,7 @@ from msg_adapters.pairs import (
     view_from_msgs,
     voxel_grid_from_msgs,
 )
-from msg_adapters.topics import STREAMS, TOPICS, VIEW_STREAMS, absolute_name
+from msg_adapters.topics import STREAMS, TOPICS, VIEW_STREAMS, VOXEL_STREAMS, absolute_name, split_prefix
 from msg_adapters.track import track_from_msg
 
 from .bag import BagReader
@@ -329,7 +329,7 @@ def _read(stream_name: str, image: Any, info: Any) -> Any:
         return coherent_image_from_msgs(image, info)
     if stream_name == "sector":
         return sector_from_msgs(image, info)
-    if stream_name in ("voxel_grid", "voxel_views"):
+    if split_prefix(stream_name)[1] in VOXEL_STREAMS:
         return voxel_grid_from_msgs(image, info, stream_name)
     if stream_name in VIEW_STREAMS:
         return view_from_msgs(image, info, stream_name)

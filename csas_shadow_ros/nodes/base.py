@@ -40,7 +40,7 @@ from msg_adapters import (
     Level,
     Pairer,
     RclpyMessages,
-    SearchMessage,
+    SearchNews,
     TargetBox,
     ViewProgress,
     decision_from_msg,
@@ -921,7 +921,7 @@ class TargetInlet:
         self.decision = Decision(None)
         #: Name of the run that it is of; None where nobody says.
         self.run_ns: int | None = None
-        self._searched: SearchMessage | None = None
+        self._searched: SearchNews | None = None
         self._early: Any = None
         if self.known:
             size = getattr(p, "size_m", (0.0, 0.0, 0.0))

@@ -23,6 +23,7 @@ from csas_shadow_ros.core.reconstruction import Reconstruction
 from csas_shadow_ros.core.shape.result import Result
 from csas_shadow_ros.core.warm import warm_carving
 from msg_adapters import Heartbeat, result_to_msgs, view_from_msgs
+from msg_adapters.measurements import numbered_objects
 from msg_adapters.topics import RESULT_TOPICS
 
 from . import qos
@@ -82,8 +83,8 @@ class VoxelCarverNode(CsasNode):
         """Drop the run."""
         self.reconstruction: Reconstruction | None = None
         self.result: Result | None = None
-        #: How many further objects were published.
-        self.further_shown = 0
+        #: Highest number of an object that was published.
+        self.highest = 0
 
     def inlet_of(self, stream: str, *, optional: bool = False) -> Inlet:
         """Make the inlet of a stream."""
@@ -247,10 +248,10 @@ class VoxelCarverNode(CsasNode):
             return final or bool(self.outlet(name).get_subscription_count())
 
         for name, message in result_to_msgs(
-            self.messages, result, stamp_ns=stamp, wanted=looked_at, before=self.further_shown
+            self.messages, result, stamp_ns=stamp, wanted=looked_at, before=self.highest
         ):
             self.outlet(name).publish(message)
-        self.further_shown = len(result.further)
+        self.highest = max(numbered_objects(result), default=0)
 
 
 def main() -> int:

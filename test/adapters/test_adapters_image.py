@@ -36,6 +36,8 @@ def sample(stream_name, encoding=None):
         return (rng.random(SHAPE) < 0.5).astype(np.uint8) * 255
     if stream_name == "color_by_aspect":
         return rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
+    if stream_name == "matter":
+        return (rng.random((*SHAPE, 4)) < 0.5).astype(np.uint8) * 255
     if stream_name == "voxel_views":
         return rng.integers(0, 361, (*SHAPE, 4)).astype(np.float32)
     if stream_name == "voxel_grid":
@@ -43,11 +45,7 @@ def sample(stream_name, encoding=None):
     return rng.random(SHAPE).astype(np.float32)
 
 
-CASES = [
-    (name, encoding if encoding != "32FCn" else "32FC4")
-    for name, s in STREAMS.items()
-    for encoding in s.encodings
-]
+CASES = [(name, encoding.replace("Cn", "C4")) for name, s in STREAMS.items() for encoding in s.encodings]
 
 
 @pytest.mark.parametrize(("stream_name", "encoding"), CASES)
