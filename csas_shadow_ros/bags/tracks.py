@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from csas_shadow_ros.core.errors import BagError, CsasError
-from csas_shadow_ros.core.geometry import Track, TrackBook, passage
+from csas_shadow_ros.core.geometry import Track, TrackBook, ViewInfo, passage
+from msg_adapters.camera_info import view_info_from_msg
 from msg_adapters.topics import STREAMS, VIEW_STREAMS, absolute_name
 from msg_adapters.track import track_piece_from_msg
 
@@ -131,13 +133,29 @@ class BagRuns:
             f" {others}"
         )
 
+    def _view_infos(self) -> list[ViewInfo]:
+        """Return what the views of this run say of themselves, of the first stage that the bag has any of."""
+        for stage in VIEW_STREAMS:
+            found = []
+            for _, message, stamp in checked_messages(
+                self._reader, STREAMS[stage].info_topic, lambda _: None
+            ):
+                # What is not legible is named where the views are read.
+                with contextlib.suppress(CsasError):
+                    if self.covers(stamp):
+                        found.append(view_info_from_msg(message, stage))
+            if found:
+                return found
+        return []
+
     def track(
         self, image_ns: int | None, infos: Sequence[SectorInfo]
     ) -> tuple[Track | None, tuple[str, ...]]:
         """Return the passage that counts and what is to be said of it; None and why if there is none."""
         if self.name is None:
             return None, ()
-        sectors = [(i.stamp_ns, i.aspect_rad - i.aperture_rad / 2.0, i.aperture_rad) for i in infos]
+        named = infos or ([] if image_ns is not None else self._view_infos())
+        sectors = [(i.stamp_ns, i.aspect_rad - i.aperture_rad / 2.0, i.aperture_rad) for i in named]
         notes = self.book.notes(self.name)
         try:
             found = passage(self.book.track(self.name), image_ns=image_ns, sectors=sectors)

@@ -145,7 +145,25 @@ def test_sectors_name_the_lap(tmp_path):
     sectors = [s for s, _ in sectors_of_run(image_at(END_NS), low, 30.0)]
     run = read_run(bag(tmp_path / "run", tracks=[both], sectors=sectors))
     np.testing.assert_array_equal(run.track.positions_m, low.positions_m)
-    assert "up to 9.0 m apart: the passage that the sectors' stamps name counts" in run.problems[0].reason
+    assert (
+        "up to 9.0 m apart: the passage that the stamps of sectors or views name counts"
+        in run.problems[0].reason
+    )
+
+
+def test_views_name_the_lap(tmp_path):
+    low = circle()
+    both = Track(
+        np.r_[low.stamps_ns - 360 * SECOND_NS, low.stamps_ns],
+        np.vstack([np.add(low.positions_m, (0.0, 0.0, 9.0)), low.positions_m]),
+    )
+    views = [view(START_NS + degrees * SECOND_NS, degrees) for degrees in range(0, 360, 6)]
+    path = bag(tmp_path / "run", tracks=[both], views=views)
+    track = read_run(path).track
+    # The view at 0 was made at the very beginning of the lap: half of its aperture may be of the one before.
+    assert {track.at_aspect(math.radians(a))[1][2] for a in range(354)} == {18.0}
+    assert len(list(read_run(path).views("likelihood"))) == 60
+    assert [f.level for f in check_bag(path).findings if f.topic.startswith("/csas/likelihood")] == []
 
 
 @pytest.fixture

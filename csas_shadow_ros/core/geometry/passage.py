@@ -123,8 +123,8 @@ def passage(
         Stamp of the full-circle image. Of aspects that are passed several times, the last passage until then
         counts; the first one after it where there is none before.
     sectors : sequence of (int, float, float)
-        Stamp (ns), start (rad) and width (rad) of each sector. Of an aspect that is passed several times, the
-        passage counts that is nearest in time to a sector which covers the aspect.
+        Stamp (ns), start (rad) and width (rad) of each sector, or of the aperture of each view. Of an aspect
+        that is passed several times, the passage counts that is nearest in time to a sector which covers it.
 
     Returns
     -------
@@ -549,7 +549,7 @@ class _Selection:
         arcs = table.arcs(chosen)
         if not arcs:
             return
-        by = "the image's stamp names" if self.image_ns is not None else "the sectors' stamps name"
+        by = "the image's stamp names" if self.image_ns is not None else "the stamps of sectors or views name"
         used = self.kept & ~dropped
         times = self.track.stamps_ns[used] if used.any() else self.track.stamps_ns
         named = ", ".join(str(arc) for arc in arcs[:4])
