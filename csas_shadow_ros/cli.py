@@ -172,6 +172,16 @@ def parameters_of(arguments: argparse.Namespace) -> PipelineParameters:
     return pipeline_parameters(values)
 
 
+def _run_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--run",
+        type=int,
+        metavar="N",
+        help="which of the bag's runs: its number in time from 1, or its name, the stamp (ns) of its track's"
+        " first pose (the first one that has an image or sectors)",
+    )
+
+
 def _results_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("results")
     group.add_argument("--out", required=True, metavar="DIR", help="results folder to make")
@@ -226,6 +236,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     check.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
     check.add_argument("--namespace", help="namespace of its topics (found by itself)")
+    _run_option(check)
     _common(check)
     info = add(
         "info",
@@ -410,6 +421,7 @@ def _run_options(p: argparse.ArgumentParser) -> None:
 
     p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
     p.add_argument("--namespace", help="namespace of its topics (found by itself)")
+    _run_option(p)
     p.add_argument(
         "--start-from",
         choices=START_FROM,
@@ -573,7 +585,7 @@ def _simulate(arguments: argparse.Namespace, console: Console) -> int:
 def _check(arguments: argparse.Namespace, console: Console) -> int:
     from .bags import check_bag
 
-    report = check_bag(arguments.bag, arguments.namespace)
+    report = check_bag(arguments.bag, arguments.namespace, arguments.run)
     console.result(str(report), report.as_dict())
     return OK if report.ok else FAILED
 
@@ -703,6 +715,7 @@ def _run(arguments: argparse.Namespace, console: Console) -> int:
             start_from=arguments.start_from,
             spectrum_sign=arguments.spectrum_sign,
             namespace=arguments.namespace,
+            run_of_bag=arguments.run,
             overwrite=arguments.overwrite,
             write_bag=not arguments.no_bag,
             figures=not arguments.no_figures,

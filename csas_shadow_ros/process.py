@@ -46,6 +46,7 @@ def process_bag(
     start_from: str = "auto",
     spectrum_sign: int | None = None,
     namespace: str | None = None,
+    run_of_bag: int | None = None,
     overwrite: bool = False,
     write_bag: bool = True,
     figures: bool = True,
@@ -71,6 +72,8 @@ def process_bag(
         +1 or -1 instead of what the bag states; said in a notice and in the report.
     namespace : str, optional
         Namespace of the topics; found by itself if not given.
+    run_of_bag : int, optional
+        Which of several runs of the bag, as in `read_run`.
     overwrite, write_bag, figures
         See `ResultsWriter`.
     workers : int
@@ -98,7 +101,7 @@ def process_bag(
     p = parameters or PipelineParameters()
     with ResultsWriter(out, overwrite=overwrite, bag=write_bag, figures=figures) as writer:
         began = time.perf_counter()
-        run = read_run(bag, namespace)
+        run = read_run(bag, namespace, run_of_bag)
         truth = read_truth(bag)
         stage = choose_start(run, start_from)
         context = Context(p, command, stage=stage, truth=truth, spectrum_sign_override=spectrum_sign)
@@ -170,7 +173,7 @@ def replay_bag(
         stage = start_from
         if choose_start(run, start_from) == "image":
             image = run.coherent_image()
-            refuse_contradictions(image, run.require_track(), notice)
+            refuse_contradictions(image, run.require_track(), notice, run)
             if run.image is None:
                 stage = "sector"  # also where there is an image that cannot be used
                 tell_of_sectors(run, notice)
@@ -241,7 +244,7 @@ def _from_image(
 ) -> Result:
     began = time.perf_counter()
     image, track = run.coherent_image(), run.require_track()
-    refuse_contradictions(image, track, notice)
+    refuse_contradictions(image, track, notice, run)
     if run.image is None:
         tell_of_sectors(run, notice)
     context.timings_s["read"] += time.perf_counter() - began
@@ -363,7 +366,9 @@ def decision_of_views(
     return decide_by_views(each, stage, parameters.target, max_objects)
 
 
-def refuse_contradictions(image: CoherentImage, track: Track, notice: Notice = _ignore) -> None:
+def refuse_contradictions(
+    image: CoherentImage, track: Track, notice: Notice = _ignore, run: Run | None = None
+) -> None:
     """Refuse an image, band and track that cannot belong together: "no object" would be a false answer.
 
     Parameters
@@ -374,16 +379,22 @@ def refuse_contradictions(image: CoherentImage, track: Track, notice: Notice = _
         The track.
     notice : callable
         Called with each doubt that is no reason to refuse.
+    run : Run, optional
+        Takes each such doubt as a problem, for the report.
 
     Raises
     ------
     BagError
         With what is wrong and what to do about it.
     """
-    for level, problem, remedy in (*judge_coverage(track), *judge_image(image, track)):
+    judged = [("track", found) for found in judge_coverage(track)]
+    judged += [("image", found) for found in judge_image(image, track)]
+    for relative, (level, problem, remedy) in judged:
         if level == ERROR:
             raise BagError(f"{problem}. {remedy}")
         notice(f"{level}: {problem}. {remedy}")
+        if run is not None:
+            run.report(Problem(absolute_name(relative, run.namespace), None, None, problem))
 
 
 def tell_of_sectors(run: Run, notice: Notice = _ignore) -> None:

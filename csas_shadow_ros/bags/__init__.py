@@ -2,7 +2,8 @@
 
 from .bag import BagMessage, BagReader, BagWriter, TopicInfo, copy, qos_profile
 from .check import CheckReport, Finding, check_bag
-from .run import MessagePair, Problem, Run, iterate_pairs, read_run, write_run
+from .pairs import MessagePair, Problem, iterate_pairs
+from .run import Run, read_run, write_run
 
 __all__ = [
     "BagMessage",

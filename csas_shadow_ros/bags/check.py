@@ -23,10 +23,11 @@ from msg_adapters.pairs import (
     voxel_grid_from_msgs,
 )
 from msg_adapters.topics import STREAMS, TOPICS, VIEW_STREAMS, VOXEL_STREAMS, absolute_name, split_prefix
-from msg_adapters.track import track_from_msg
 
 from .bag import BagReader
-from .run import Problem, Run, checked_messages, iterate_pairs, read_run
+from .pairs import Problem, iterate_pairs
+from .run import Run, read_run
+from .tracks import BagRuns
 
 ERROR, WARNING, INFO = "error", "warning", "info"
 
@@ -34,6 +35,10 @@ ERROR, WARNING, INFO = "error", "warning", "info"
 BAND_MARGIN = 0.1
 #: Less of an image's energy inside its stated band than this contradicts the band.
 MIN_BAND_ENERGY = 0.5
+#: An image whose energy is off by more band widths, and not inside, was not seen from there, or in that band:
+#: heights are wrong by more than a third. At half of it a sound speed that is wrong by 8 % is refused; at
+#: double, z that is a depth (28 m for 12) makes a box of 0.4 m 1.03 m high.
+REFUSED_BAND_SHIFT = 0.5
 #: Less than this is worth a word.
 GOOD_BAND_ENERGY = 0.8
 #: The middle of an image's energy may lie this far from that of the stated band, in band widths.
@@ -45,6 +50,11 @@ MAX_ZEROS = 0.01
 #: A view's sonar may be this fraction of its range away from the track at the view's stamp.
 SONAR_TOLERANCE = 0.02
 _MAX_FFT_SIDE = 1024
+#: No vehicle circles within less: positions that are all within it are no metres.
+_LEAST_CIRCLE_M = 0.5
+#: No sonar's circle is so far from its scene: positions beyond it are of another frame.
+_MAP_M = 10_000.0
+_ONE_CLOCK = "Stamp images and poses by one clock: an image with the time when its last data came."
 #: A stated aspect may be so far off from what the track has, beyond half a sector.
 _ASPECT_SLACK_RAD = math.radians(3.0)
 
@@ -136,7 +146,7 @@ class CheckReport:
         return texts
 
 
-def check_bag(path: str | Path, namespace: str | None = None) -> CheckReport:
+def check_bag(path: str | Path, namespace: str | None = None, run: int | None = None) -> CheckReport:
     """Read a whole bag and report everything that breaks the contract or contradicts itself.
 
     Parameters
@@ -145,6 +155,8 @@ def check_bag(path: str | Path, namespace: str | None = None) -> CheckReport:
         A rosbag2 directory or a lone storage file.
     namespace : str, optional
         Namespace of its topics; found by itself if not given.
+    run : int, optional
+        Which of several runs is judged, as in `read_run`.
 
     Returns
     -------
@@ -159,7 +171,7 @@ def check_bag(path: str | Path, namespace: str | None = None) -> CheckReport:
             Finding(ERROR, "", None, None, str(error), "Name a rosbag2 directory, an .mcap or a .db3 file.")
         )
         return report
-    _Check(reader, report).run()
+    _Check(reader, report, run).run()
     # Damage comes first: what is missing elsewhere follows from it.
     report.findings.sort(
         key=lambda f: ((ERROR, WARNING, INFO).index(f.level), f.problem not in reader.problems)
@@ -168,9 +180,11 @@ def check_bag(path: str | Path, namespace: str | None = None) -> CheckReport:
 
 
 class _Check:
-    def __init__(self, reader: BagReader, report: CheckReport) -> None:
+    def __init__(self, reader: BagReader, report: CheckReport, run: int | None = None) -> None:
         self.reader = reader
         self.report = report
+        self.chosen = run
+        self.runs: BagRuns | None = None
         self.track: Track | None = None
 
     def say(self, level: str, topic: str, problem: str, remedy: str = "", **place: int | None) -> None:
@@ -226,19 +240,48 @@ class _Check:
 
     def find_track(self) -> None:
         topic = self.name("track")
-        for message, path, stamp in checked_messages(self.reader, "track", self.problem):
-            try:
-                track = track_from_msg(path)
-            except CsasError as error:
-                self.problem(Problem(topic, message.number, stamp, str(error)))
-                continue
-            if self.track is None or len(track) >= len(self.track):
-                self.track = track
+
+        def report(problem: Problem) -> None:
+            if problem.number is None and problem.reason.startswith("the bag holds"):
+                self.say(WARNING, topic, problem.reason, "Or record each run into a bag of its own.")
+            else:
+                self.problem(problem)
+
+        try:
+            self.runs = BagRuns(self.reader, report, self.chosen)
+        except BagError as error:
+            self.say(ERROR, topic, str(error), "Name a run of this bag.")
+            return
+        images = [s for s in self.runs.stamps("image") if self.runs.covers(s)]
+        infos = [] if images else self.run_without_pixels(self.runs).sector_infos()
+        self.track, notes = self.runs.track(images[0] if images else None, infos)
+        for note in notes:
+            remedy = "Views are made from the poses that are left. Check that the circle is what was flown."
+            self.say(ERROR if self.track is None else WARNING, topic, note, remedy)
         if self.track is None:
             return
         self.report.usable["track"] = len(self.track)
         for level, problem, remedy in judge_coverage(self.track):
             self.say(level, topic, problem, remedy)
+
+    def run_without_pixels(self, runs: BagRuns) -> Run:
+        path, namespace = Path(self.reader.path), self.reader.namespace
+        return Run(path, namespace, None, None, {}, [], runs.name, runs.names, runs, self.reader)
+
+    def is_mine(self, stream_name: str, topic: str, number: int, stamp_ns: int) -> bool:
+        """Say whether a message is of the run that is judged; name one that no track covers."""
+        if self.runs is None or self.runs.covers(stamp_ns):
+            if self.runs is not None and stream_name == "image" and (doubt := self.runs.doubt(stamp_ns)):
+                self.say(WARNING, topic, doubt, _ONE_CLOCK, number=number, stamp_ns=stamp_ns)
+            return True
+        if self.runs.is_of_another(stamp_ns):
+            return False
+        if stream_name in ("image", "sector"):
+            # A run goes on without a sector, but not without its image.
+            level = ERROR if stream_name == "image" else WARNING
+            self.say(level, topic, self.runs.not_covered(), _ONE_CLOCK, number=number, stamp_ns=stamp_ns)
+            return False
+        return len(self.runs.names) < 2 or stream_name not in VIEW_STREAMS
 
     def check_stream(self, stream_name: str) -> None:
         usable = 0
@@ -247,6 +290,8 @@ class _Check:
                 item = _read(stream_name, pair.image, pair.info)
             except CsasError as error:
                 self.problem(Problem(pair.topic, pair.number, pair.stamp_ns, str(error)))
+                continue
+            if not self.is_mine(stream_name, pair.topic, pair.number, pair.stamp_ns):
                 continue
             usable += 1
             place = {"number": pair.number, "stamp_ns": pair.stamp_ns}
@@ -270,7 +315,7 @@ class _Check:
 
     def check_sector_sum(self) -> int:
         """Judge the image that the sectors add up to; return how many of them it holds."""
-        run = read_run(self.reader.path, self.reader.namespace)
+        run = read_run(self.reader.path, self.reader.namespace, self.chosen)
         try:
             total = run.sector_sum()
         except CsasError:
@@ -278,7 +323,7 @@ class _Check:
         finally:
             topic = self.name("sector/image")
             for problem in run.problems:
-                if problem.topic == topic:
+                if problem.topic == topic and "no track covers" not in problem.reason:
                     self.problem(problem)
         if self.track is not None:
             image = total.image()
@@ -345,9 +390,10 @@ def judge_coverage(track: Track) -> Iterator[tuple[str, str, str]]:
     arcs += f" and {len(gaps) - 8} more" if len(gaps) > 8 else ""
     problem = f"the track covers {math.degrees(track.coverage_rad):.1f} of 360 degrees; missing: {arcs}"
     if track.coverage_rad < MIN_COVERAGE_RAD:
+        why = track.doubtful[0].why(track.doubtful[0].start_rad) if track.doubtful else _not_round(track)
         yield (
             ERROR,
-            f"{problem}: no view can be made",
+            f"{problem}: no view can be made{why and f'; {why}'}",
             "Record the track round the origin of csas_scene, in metres, with poses at most"
             f" {math.degrees(track.max_gap_rad):g} degrees apart.",
         )
@@ -357,6 +403,26 @@ def judge_coverage(track: Track) -> Iterator[tuple[str, str, str]]:
         problem,
         "No views are made in these arcs. Record the track round the whole circle if it was flown.",
     )
+
+
+def _not_round(track: Track) -> str:
+    """Say where a track is that does not go round the origin; empty if it is not far from it."""
+    x, y = track.positions_m[:, 0], track.positions_m[:, 1]
+    low, high = track.positions_m.min(axis=0), track.positions_m.max(axis=0)
+    away = float(np.hypot(x, y).min())
+    size = float(np.hypot(high[0] - low[0], high[1] - low[1]))
+    # From where it is, a circle would have to be as large as it is far away to go round the origin.
+    if size > away:
+        return ""
+    text = (
+        f"its poses lie at x = {low[0]:.6g} to {high[0]:.6g} and y = {low[1]:.6g} to {high[1]:.6g}, at least"
+        f" {away:.6g} m from the scene's origin, and do not go round it"
+    )
+    if size < _LEAST_CIRCLE_M and np.abs(x).max() <= 180.0 and np.abs(y).max() <= 180.0:
+        return f"{text}: these look like degrees of latitude and longitude, not metres"
+    if away > _MAP_M:
+        return f"{text}: these look like map coordinates (UTM); take the scene's origin off them"
+    return text
 
 
 def judge_image(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, str]]:
@@ -542,26 +608,49 @@ def judge_energy(image: CoherentImage, track: Track) -> Iterator[tuple[str, str,
     # Of an annulus that is filled evenly, 5 and 95 % of the energy lie below these.
     inner, outer = (math.sqrt(low**2 + share * (high**2 - low**2)) for share in (0.05, 0.95))
     found, expected = (energy.low_rad_m + energy.high_rad_m) / 2, (inner + outer) / 2
-    shifted = abs(found - expected) > MAX_BAND_SHIFT * (high - low)
+    shift = abs(found - expected) / (high - low)
+    shifted = shift > MAX_BAND_SHIFT
+    place = _height_of_band(track, found / expected) if shifted else ""
     if energy.fraction >= GOOD_BAND_ENERGY and not shifted:
         return
     if energy.fraction >= GOOD_BAND_ENERGY:
         yield (
             WARNING,
             f"the image's energy is centred on K {found:.1f} rad/m,"
-            f" {100 * (found / expected - 1):+.0f} % from the stated band's {expected:.1f}",
+            f" {100 * (found / expected - 1):+.0f} % from the stated band's {expected:.1f}{place}",
             f"Is the centre frequency {image.acoustics.centre_frequency_hz * found / expected:.0f} Hz? Check"
             " it and the sound speed (camera_info.d), and the pixel spacing (p), which scales all lengths.",
         )
         return
     to_hz = image.acoustics.sound_speed_mps / (4 * math.pi * math.cos(track.grazing_rad))
     yield (
-        ERROR if energy.fraction < MIN_BAND_ENERGY else WARNING,
+        ERROR if energy.fraction < MIN_BAND_ENERGY or shift > REFUSED_BAND_SHIFT else WARNING,
         f"{100 * energy.fraction:.0f} % of the image's energy lies in its stated band, K {low:.1f} to"
-        f" {high:.1f} rad/m; 90 % of it lies at K {energy.low_rad_m:.1f} to {energy.high_rad_m:.1f} rad/m",
+        f" {high:.1f} rad/m; 90 % of it lies at K {energy.low_rad_m:.1f} to {energy.high_rad_m:.1f}"
+        f" rad/m{place}",
         f"With the stated sound speed that is {energy.low_rad_m * to_hz:.0f} to"
         f" {energy.high_rad_m * to_hz:.0f} Hz: check centre frequency, bandwidth and sound speed"
         " (camera_info.d[0:3]), the pixel spacing (p), and that the image is not at baseband.",
+    )
+
+
+def _height_of_band(track: Track, ratio: float) -> str:
+    """Say which height of the sonar fits a band `ratio` times the stated one; empty if none does.
+
+    On the ground K is 4 pi f cos(psi) / c: what is wrong may be f, c, or the grazing angle psi.
+    """
+    reach = float(np.hypot(track.positions_m[:, 0], track.positions_m[:, 1]).mean())
+    height = float(track.positions_m[:, 2].mean())
+    cosine = ratio * math.cos(track.grazing_rad)
+    if not 0.0 < cosine < 1.0:
+        return ""
+    fits = reach * math.tan(math.acos(cosine))
+    # A depth for a height is a factor of some; beyond five it is another thing that is wrong.
+    if not height / 5.0 <= fits <= 5.0 * height:
+        return ""
+    return (
+        f"; it fits a sonar {fits:.1f} m above the seabed, but the track has z = {height:.1f} m: is z the"
+        " height above the seabed, not a depth?"
     )
 
 

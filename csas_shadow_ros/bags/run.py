@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from csas_shadow_ros.core.geometry import CoherentImage, Track, View
 from csas_shadow_ros.core.sector import Sector, unlike
 from msg_adapters.camera_info import SectorInfo, sector_info_from_msg
 from msg_adapters.image import largest_part, quantise
-from msg_adapters.messages import RosbagsMessages, stamp_to_ns
+from msg_adapters.messages import RosbagsMessages
 from msg_adapters.pairs import (
     coherent_image_from_msgs,
     coherent_image_to_msgs,
@@ -31,45 +30,17 @@ from msg_adapters.topics import (
     absolute_name,
     stream,
 )
-from msg_adapters.track import track_from_msg, track_to_msg
+from msg_adapters.track import track_to_msg
 
-from .bag import BagMessage, BagReader, BagWriter
+from .bag import BagReader, BagWriter
+from .pairs import Problem, checked_messages, iterate_pairs
+from .tracks import BagRuns
 
 if TYPE_CHECKING:
     from csas_shadow_ros.core.search.decision import Decision
     from csas_shadow_ros.core.streaming import SectorSum
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Problem:
-    """One thing that is wrong in a bag.
-
-    Parameters
-    ----------
-    topic : str
-        Absolute name; empty if it concerns the bag itself.
-    number : int or None
-        Which message of that topic, from 0.
-    stamp_ns : int or None
-        The message's stamp.
-    reason : str
-        What is wrong.
-    """
-
-    topic: str
-    number: int | None
-    stamp_ns: int | None
-    reason: str
-
-    def __str__(self) -> str:
-        place = self.topic
-        if self.number is not None:
-            place += f" message {self.number}"
-        if self.stamp_ns is not None:
-            place += f" ({self.stamp_ns} ns)"
-        return f"{place}: {self.reason}" if place else self.reason
 
 
 @dataclass
@@ -88,11 +59,15 @@ class Run:
     image : CoherentImage or None
         The full-circle image, if the bag holds one.
     track : Track or None
-        The track, if the bag holds one.
+        The track, if the bag holds one: of all poses of the run the passage that its image or sectors name.
     counts : dict
-        Number of image messages of each stream that the bag holds.
+        Number of image messages of each stream that the bag holds; of this run, if it holds several.
     problems : list of Problem
         What was wrong so far; grows while views are iterated.
+    run_ns : int or None
+        Name of the run: the stamp of its track's first pose. None without a track.
+    run_names : tuple of int
+        Names of all runs of the bag, in time.
     """
 
     path: Path
@@ -102,6 +77,8 @@ class Run:
     counts: dict[str, int]
     problems: list[Problem] = field(default_factory=list)
     run_ns: int | None = None
+    run_names: tuple[int, ...] = ()
+    _runs: BagRuns | None = None
     _reader: BagReader | None = None
     _sum: SectorSum | None = None
     _infos: list[SectorInfo] | None = None
@@ -130,7 +107,9 @@ class Run:
                 for _, message, _ in checked_messages(self._reader, "sector/camera_info", lambda _: None):
                     # What is not legible is named where the sectors are read.
                     with contextlib.suppress(CsasError):
-                        self._infos.append(sector_info_from_msg(message))
+                        info = sector_info_from_msg(message)
+                        if self._runs is None or self._runs.covers(info.stamp_ns):
+                            self._infos.append(info)
         return self._infos
 
     def sector_sum(self) -> SectorSum:
@@ -222,11 +201,24 @@ class Run:
     def _each(self, stream_name: str, read: Callable[[Any, Any], T]) -> Iterator[T]:
         if self._reader is None:
             return
+        uncovered: list[int] = []
         for pair in iterate_pairs(self._reader, stream_name, self.report):
+            if self._runs is not None and not self._runs.covers(pair.stamp_ns):
+                if self._runs.is_of_another(pair.stamp_ns):
+                    continue
+                # An outside program may stamp views as it likes, where no other run can be meant.
+                if stream_name == "sector" or len(self.run_names) > 1:
+                    uncovered.append(pair.stamp_ns)
+                    continue
             try:
                 yield read(pair.image, pair.info)
             except CsasError as error:
                 self.report(Problem(pair.topic, pair.number, pair.stamp_ns, str(error)))
+        if uncovered and self._runs is not None:
+            what = f"the stamps of {len(uncovered)} {stream_name} messages,"
+            what += f" {min(uncovered)} to {max(uncovered)} ns"
+            topic = absolute_name(stream(stream_name).image_topic, self.namespace)
+            self.report(Problem(topic, None, None, f"{self._runs.not_covered(what)}; they are passed over"))
 
     def report(self, problem: Problem) -> None:
         """Note a problem; the same one only once."""
@@ -256,92 +248,7 @@ def odd_sectors(infos: Iterable[SectorInfo]) -> dict[int, str]:
     return reasons
 
 
-@dataclass(frozen=True, eq=False)
-class MessagePair:
-    """An image and its camera_info, decoded but not checked, and both as they were recorded."""
-
-    topic: str
-    number: int
-    stamp_ns: int
-    image: Any
-    info: Any
-    image_cdr: memoryview
-    info_cdr: memoryview
-
-
-def checked_messages(
-    reader: BagReader, relative: str, report: Callable[[Problem], None]
-) -> Iterator[tuple[BagMessage, Any, int]]:
-    """Iterate (message, decoded, stamp) of a topic; a stamp that comes again is passed over.
-
-    A latched message may be recorded several times: the same stamp with the same bytes counts once,
-    with other bytes it is reported.
-    """
-    info = reader.topic(relative)
-    if info is None:
-        return
-    expected = TOPICS[relative].type_name
-    if info.type_name != expected:
-        report(Problem(info.name, None, None, f"its type is {info.type_name!r}; expected {expected}"))
-        return
-    seen: dict[int, bytes | memoryview] = {}
-
-    def digest(cdr: memoryview) -> bytes:
-        return hashlib.blake2b(cdr, digest_size=16).digest()
-
-    for message in reader.messages([info.name]):
-        try:
-            decoded = message.decode()
-            stamp = stamp_to_ns(decoded.header.stamp)
-        except CsasError as error:
-            report(Problem(info.name, message.number, None, str(error)))
-            continue
-        if (before := seen.get(stamp)) is not None:
-            if (digest(before) if isinstance(before, memoryview) else before) != digest(message.cdr):
-                reason = "differs from an earlier message of the same stamp"
-                report(Problem(info.name, message.number, stamp, reason))
-            continue
-        # An image that is alone takes a second to digest, and is compared with nothing.
-        seen[stamp] = message.cdr if info.count == 1 else digest(message.cdr)
-        yield message, decoded, stamp
-
-
-def iterate_pairs(
-    reader: BagReader, stream_name: str, report: Callable[[Problem], None]
-) -> Iterator[MessagePair]:
-    """Iterate a stream's images with the camera_info of the same stamp, whatever their order.
-
-    Parameters
-    ----------
-    reader : BagReader
-        The bag.
-    stream_name : str
-        Name of the image stream.
-    report : callable
-        Called with each `Problem`: other types, undecodable messages, lonely images and infos.
-    """
-    kind = stream(stream_name)
-    info_topic = absolute_name(kind.info_topic, reader.namespace)
-    # Camera infos are small: all are read first, so that no image ever waits in memory.
-    infos = {s: (m, d) for m, d, s in checked_messages(reader, kind.info_topic, report)}
-    used: set[int] = set()
-    for message, image, stamp in checked_messages(reader, kind.image_topic, report):
-        if stamp not in infos:
-            missing = f"has no camera_info of the same stamp on {info_topic}"
-            if infos:
-                nearest = min(infos, key=lambda s: abs(s - stamp))
-                missing += f" (the nearest is {nearest} ns)"
-            report(Problem(message.topic, message.number, stamp, missing))
-            continue
-        used.add(stamp)
-        own, info = infos[stamp]
-        yield MessagePair(message.topic, message.number, stamp, image, info, message.cdr, own.cdr)
-    for stamp, (own, _) in infos.items():
-        if stamp not in used:
-            report(Problem(info_topic, own.number, stamp, "has no image of the same stamp"))
-
-
-def read_run(path: str | Path, namespace: str | None = None) -> Run:
+def read_run(path: str | Path, namespace: str | None = None, run: int | None = None) -> Run:
     """Read a run from a bag.
 
     Parameters
@@ -350,6 +257,9 @@ def read_run(path: str | Path, namespace: str | None = None) -> Run:
         A rosbag2 directory or a lone storage file.
     namespace : str, optional
         Namespace of its topics; found by itself if not given.
+    run : int, optional
+        Which of several runs: its name (stamp of its track's first pose, ns) or its number in time, from 1.
+        The first one that has an image or sectors if not given.
 
     Returns
     -------
@@ -359,22 +269,37 @@ def read_run(path: str | Path, namespace: str | None = None) -> Run:
     Raises
     ------
     BagError
-        If there is no bag to read.
+        If there is no bag to read, or it has no such run.
     """
     reader = BagReader(path, namespace)
     found = {name: reader.topic(s.image_topic) for name, s in STREAMS.items()}
     counts = {name: info.count for name, info in found.items() if info is not None and info.count}
-    run = Run(Path(path), reader.namespace, None, None, counts, [], None, reader)
-    run.image = _one_image(run, reader)
-    run.track = _longest_track(run, reader)
+    problems: list[Problem] = []
+    runs = BagRuns(reader, problems.append, run)
+    result = Run(Path(path), reader.namespace, None, None, counts, [], runs.name, runs.names, runs, reader)
+    if len(runs.names) > 1:
+        mine = {name: sum(map(runs.covers, runs.stamps(name))) for name in counts}
+        result.counts = {name: min(count, mine[name]) for name, count in counts.items() if mine[name]}
+    result.image = _one_image(result, reader, runs)
+    for problem in problems:
+        result.report(problem)
+    image_ns = None if result.image is None else result.image.stamp_ns
+    infos = result.sector_infos() if result.image is None and counts.get("sector") else []
+    result.track, notes = runs.track(image_ns, infos)
+    for note in notes:
+        result.report(Problem(runs.topic, None, None, note))
     for line in reader.problems:
-        run.report(Problem("", None, None, line))
-    return run
+        result.report(Problem("", None, None, line))
+    return result
 
 
-def _one_image(run: Run, reader: BagReader) -> CoherentImage | None:
+def _one_image(run: Run, reader: BagReader, runs: BagRuns) -> CoherentImage | None:
     image: CoherentImage | None = None
     for pair in iterate_pairs(reader, "image", run.report):
+        if not runs.covers(pair.stamp_ns):
+            if not runs.is_of_another(pair.stamp_ns):
+                run.report(Problem(pair.topic, pair.number, pair.stamp_ns, runs.not_covered()))
+            continue
         if image is not None:
             reason = "is a second image; the first is used"
             run.report(Problem(pair.topic, pair.number, pair.stamp_ns, reason))
@@ -383,21 +308,10 @@ def _one_image(run: Run, reader: BagReader) -> CoherentImage | None:
             image = coherent_image_from_msgs(pair.image, pair.info)
         except CsasError as error:
             run.report(Problem(pair.topic, pair.number, pair.stamp_ns, str(error)))
-    return image
-
-
-def _longest_track(run: Run, reader: BagReader) -> Track | None:
-    # A track that grows during the run is published again and again: the longest is the whole.
-    best: Track | None = None
-    for message, path, stamp in checked_messages(reader, "track", run.report):
-        try:
-            track = track_from_msg(path)
-        except CsasError as error:
-            run.report(Problem(message.topic, message.number, stamp, str(error)))
             continue
-        if best is None or len(track) >= len(best):
-            best = track
-    return best
+        if doubt := runs.doubt(pair.stamp_ns):
+            run.report(Problem(pair.topic, pair.number, pair.stamp_ns, doubt))
+    return image
 
 
 def write_run(

@@ -7,9 +7,10 @@ import time
 from typing import Any
 
 from csas_shadow_ros.bags import BagReader, MessagePair, iterate_pairs
-from csas_shadow_ros.bags.run import Problem
+from csas_shadow_ros.bags.pairs import Problem
+from csas_shadow_ros.bags.tracks import BagRuns
 from csas_shadow_ros.core.errors import BagError, CsasError, ParameterError
-from msg_adapters import coherent_image_from_msgs, track_from_msg
+from msg_adapters import coherent_image_from_msgs, track_to_msg
 
 from . import qos
 from .base import CsasNode, Source, run_node
@@ -29,11 +30,12 @@ class BagPlayerNode(CsasNode):
         self.views: BagViews | None = None
         self._began: tuple[float, int] | None = None
         stage = stage_of_bag(self.reader, self.parameters.stage)
+        self.runs = BagRuns(self.reader, self._problem, self.parameters.run or None)
         self.get_logger().info(f"plays {stage} of {self.parameters.bag}")
         if stage == "image":
             self.latch_image()
         else:
-            self.views = BagViews(self.reader, stage)
+            self.views = BagViews(self.reader, stage, self.runs.covers)
             self.source = Source(self, stage, self.send_view, self.may_send)
             self.source.flow.offer(self.views.times)
             self.latch("target")
@@ -54,9 +56,11 @@ class BagPlayerNode(CsasNode):
     def latch_image(self) -> None:
         """Publish the first usable image; an unusable one if there is no other, so that it gets named."""
         found = self.reader.topic("image")
-        alone = found is not None and found.count == 1
+        alone = found is not None and found.count == 1 and len(self.runs.names) < 2
         chosen: MessagePair | None = None
         for pair in iterate_pairs(self.reader, "image", self._problem):
+            if not alone and not self.runs.covers(pair.stamp_ns):
+                continue
             chosen = pair
             if alone:
                 break  # whoever takes it looks at its pixels
@@ -71,18 +75,11 @@ class BagPlayerNode(CsasNode):
         self.latch("image", chosen.image_cdr)
 
     def latch_track(self) -> None:
-        """Publish the longest track; of a track that grew during the run it is the whole."""
-        best, longest = None, -1
-        for message in self.reader.messages(["track"]):
-            try:
-                length = len(track_from_msg(message.decode()))
-            except CsasError as error:
-                self._problem(Problem(message.topic, message.number, None, str(error)))
-                length = 0
-            if length >= longest:
-                best, longest = message.cdr, length
-        if best is not None:
-            self.latch("track", best)
+        """Publish all poses of the run that the bag's Paths hold, in one."""
+        name = self.runs.name
+        if name is not None:
+            path = track_to_msg(self.messages, self.runs.book.track(name))
+            self.publisher("track", qos.LATCHED).publish(path)
 
     def _problem(self, problem: Problem) -> None:
         self.reject(str(problem))

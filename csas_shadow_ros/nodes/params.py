@@ -147,6 +147,12 @@ class BagPlayerNodeParameters(NodeParameters, FlowParameters):
         "what to play; auto: the earliest that the bag holds whole",
         choices=("auto", "image", "sector", "sub_aperture", "shadow", "likelihood", "shadow_mask"),
     )
+    run: int = bounded(
+        0,
+        "which of the bag's runs: its number from 1, or its name (stamp of its first pose, ns); 0: the first",
+        low=0,
+        high=1 << 62,
+    )
     rate: float = bounded(
         1.0, "views: times the recorded speed; 0: as fast as they are taken", low=0.0, high=1e6
     )

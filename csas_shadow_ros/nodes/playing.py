@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from csas_shadow_ros.bags import BagReader
@@ -117,9 +117,13 @@ class BagViews:
         The bag.
     stream : str
         Name of the stream.
+    covers : callable, optional
+        Says of a stamp whether it is of the run that is played.
     """
 
-    def __init__(self, reader: BagReader, stream: str) -> None:
+    def __init__(
+        self, reader: BagReader, stream: str, covers: Callable[[int], bool] = lambda _: True
+    ) -> None:
         self._reader = reader
         self._kind = stream_of(stream)
         #: One line for each message that is not usable.
@@ -130,7 +134,7 @@ class BagViews:
         sectors = []
         for message in reader.messages([self._kind.info_topic]):
             stamp = self._stamp(message)
-            if stamp is not None and stamp not in self._infos:
+            if stamp is not None and stamp not in self._infos and covers(stamp):
                 self._infos[stamp] = bytes(message.cdr)
                 self.times[stamp] = message.log_time_ns
                 if stream == "sector":

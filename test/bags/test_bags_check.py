@@ -165,11 +165,12 @@ def spoil_frame(a, b, c):
 
 
 def spoil_order(a, b, c):
-    c.poses[3], c.poses[4] = c.poses[4], c.poses[3]
+    c.poses = c.poses[::-1]
 
 
 def spoil_depth(a, b, c):
-    c.poses[9].pose.position.z = -18.0
+    for pose in c.poses:
+        pose.pose.position.z = -18.0
 
 
 @pytest.mark.parametrize(
@@ -184,8 +185,8 @@ def spoil_depth(a, b, c):
         (spoil_stamp, "/csas/image", "has no camera_info of the same stamp", "the very same header.stamp"),
         (spoil_size, "/csas/image", "camera_info.width is 129; expected", "publisher"),
         (spoil_frame, "/csas/track", "frame_id is 'map'; expected 'csas_scene'", "publisher of /csas/track"),
-        (spoil_order, "/csas/track", "out of order: pose 4 ", "publisher of /csas/track"),
-        (spoil_depth, "/csas/track", "pose 9 is at z = -18 m", "publisher of /csas/track"),
+        (spoil_order, "/csas/track", "out of order: pose 0 ", "publisher of /csas/track"),
+        (spoil_depth, "/csas/track", "pose 0 is at z = -18 m", "publisher of /csas/track"),
     ],
 )
 def test_each_fault_is_placed_and_has_a_remedy(tmp_path, spoil, topic, problem, remedy):

@@ -26,6 +26,9 @@ IntArray = NDArray[np.int64]
 #: by 0.5 m turn such a step by 13°. At half of it they turn it by 26°, and circles fall to pieces; at double
 #: an approach that ends in a sharp turn is cut 6 m instead of 3 m beside it.
 _STEP_SHARE = 0.1
+#: A step that turns by more shows no motion round the origin: it is five usual ones. At half of it poses 15°
+#: apart are no circle; at double a way over the target is one.
+_LARGEST_STEP_RAD = math.radians(30.0)
 #: Motion goes round where so much of it is across the line of sight: within 60° of the tangent. A circle
 #: that is off centre by half its radius, or an ellipse of 2:1, stays within 37°. At 0.25 a line abeam counts
 #: as an arc of 150° and an approach from far away as part of the circle; at 1 nothing counts.
@@ -120,8 +123,8 @@ def passage(
         Stamp of the full-circle image. Of aspects that are passed several times, the last passage until then
         counts; the first one after it where there is none before.
     sectors : sequence of (int, float, float)
-        Stamp (ns), start (rad) and width (rad) of each sector. Of an aspect that is passed several times, the
-        passage counts that is nearest in time to a sector which covers the aspect.
+        Stamp (ns), start (rad) and width (rad) of each sector, or of the aperture of each view. Of an aspect
+        that is passed several times, the passage counts that is nearest in time to a sector which covers it.
 
     Returns
     -------
@@ -259,6 +262,8 @@ class _Selection:
         lengths = np.hypot(*np.diff(xy, axis=0).T)
         across = np.abs(turned) * (ranges[:-1] + ranges[1:]) / 2.0
         sense = np.where(across >= _LEAST_TANGENTIAL * lengths, np.sign(turned), 0.0).astype(int)
+        # Beside the origin itself a step turns by anything; a pause of the record is bridged below.
+        sense[np.abs(turned) > _LARGEST_STEP_RAD] = 0
         if len(sense) > 1 and lengths[-1] < _STEP_SHARE * ranges[-2]:
             sense[-1] = sense[-2]  # the rest of a step shows no direction
         gone = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -401,7 +406,7 @@ class _Selection:
     def _tangential(self, end: int, other: int, sense: int, off: FloatArray, tight: float) -> int:
         """Move an end of a stretch inwards while the way from there is straight to or from the circle."""
         step = 1 if other > end else -1
-        least = _STEP_SHARE / 2.0 * float(self.range[end])
+        least = _SAME_PLACE * float(self.range[end])
         while abs(other - end) > 2 and off[end] > tight:
             far = end
             while far != other and np.hypot(*(self.xy[far] - self.xy[end])) < least:
@@ -466,10 +471,11 @@ class _Selection:
         after = int((index > sections[-1][1]).sum())
         parts = [(before, "before it"), (len(index) - before - after, "between"), (after, "after it")]
         where = ", ".join(f"{count} {what}" for count, what in parts if count)
+        x, y = (round(c, 1) + 0.0 for c in (circle.x_m, circle.y_m))  # no -0.0
         self.notes.append(
-            f"{len(index)} of {len(self.track)} track poses are not on the circle (centre ({circle.x_m:.1f},"
-            f" {circle.y_m:.1f}) m, radius {circle.radius_m:.1f} m; they are up to {off.max():.1f} m off it):"
-            f" {where}; they are left out"
+            f"{len(index)} of {len(self.track)} track poses are not on the circle (centre ({x:.1f}, {y:.1f})"
+            f" m, radius {circle.radius_m:.1f} m; they are up to {off.max():.1f} m off it): {where}; they are"
+            " left out"
         )
         self.kept &= on
         self.elsewhere |= out
@@ -543,7 +549,7 @@ class _Selection:
         arcs = table.arcs(chosen)
         if not arcs:
             return
-        by = "the image's stamp names" if self.image_ns is not None else "the sectors' stamps name"
+        by = "the image's stamp names" if self.image_ns is not None else "the stamps of sectors or views name"
         used = self.kept & ~dropped
         times = self.track.stamps_ns[used] if used.any() else self.track.stamps_ns
         named = ", ".join(str(arc) for arc in arcs[:4])
@@ -640,11 +646,11 @@ class _Passages:
         else:
             centres = np.arange(_BINS) * _BIN_RAD
             for stamp, first, width in sectors:
-                covers = np.mod(centres - first + 1e-9, TWO_PI) <= width + 2e-9
+                covers = np.mod(centres - first + 1e-9, TWO_PI) < width
                 told |= covers & (self.counts > 0)
                 mine = covers[self.bins]
                 best[mine] = np.minimum(best[mine], np.abs(self.times[mine] - (stamp - start)))
-        order = np.lexsort((-self.times, best, self.bins))
+        order = np.lexsort((self.times, best, self.bins))
         winner = np.full(_BINS, -1, np.int64)
         firsts = np.flatnonzero(np.diff(self.bins[order], prepend=-1))
         winner[self.bins[order][firsts]] = order[firsts]
