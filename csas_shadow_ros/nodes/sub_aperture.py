@@ -16,7 +16,7 @@ from typing import Any
 
 from csas_shadow_ros.bags.check import ERROR, judge_band, judge_coverage, judge_geometry, judge_image
 from csas_shadow_ros.core.errors import CsasError, TrackError, ViewError
-from csas_shadow_ros.core.geometry import CoherentImage
+from csas_shadow_ros.core.geometry import CoherentImage, Track
 from csas_shadow_ros.core.parameters import SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.search.decision import Decision
 from csas_shadow_ros.core.streaming import Stream
@@ -81,6 +81,8 @@ class Run:
     #: When all sectors were here; None before, and once the whole run's target is decided on.
     ended_s: float | None = None
     refusals_sent: set[float] = field(default_factory=set)
+    #: The track that was found not to go round the circle.
+    judged: Track | None = None
 
 
 class SubApertureNode(CsasNode):
@@ -427,9 +429,10 @@ class SubApertureNode(CsasNode):
         if run.image_stamp is not None and run.image is not None:
             for level, problem, remedy in judge_coverage(stream.track):
                 if level == ERROR:
-                    # It may still grow.
-                    self.log_throttled("coverage", f"track: {problem}. {remedy}", "warn")
-                    return False
+                    if run.judged is not stream.track:
+                        run.judged = stream.track
+                        self.reject(f"{problem}. {remedy}")
+                    return False  # it may still grow
             found = [*judge_image(run.image, stream.track)]
         elif run.image_stamp is None and stream.ended:
             found = [*judge_image(stream.sum.image(), stream.track)]

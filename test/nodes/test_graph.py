@@ -47,8 +47,8 @@ def assert_same_grid(carver: VoxelCarverNode, reference: Reference) -> None:
     result = reference[0]
     grids = [g for g in (result.grid, result.other_grid) if g and g.method == carver.parameters.method]
     assert grids, f"the reference has no {carver.parameters.method} grid"
-    assert carver.carver is not None
-    grid = carver.carver.grid()
+    assert carver.reconstruction is not None
+    grid = carver.reconstruction.bodies[0].carver.grid()
     np.testing.assert_array_equal(grid.likelihood, grids[0].likelihood)
     np.testing.assert_array_equal(grid.views, grids[0].views)
     np.testing.assert_array_equal(grid.occupied, grids[0].occupied)
@@ -186,8 +186,9 @@ def test_sectors_are_summed_to_the_image(
     graph: Graph, simulated: SimulatedRun, reference: Reference, tmp_path: Path
 ) -> None:
     image, track = simulated.image, simulated.track
+    stamps = [int(stamp) for stamp in track.stamps_ns[[5, 6]]]
     half = image.pixels / 2  # exact in floats, so that the sum is the image again
-    sectors = [Sector(half, image.grid, image.acoustics, s, 0.1 * i, 0.1) for i, s in enumerate((5, 6))]
+    sectors = [Sector(half, image.grid, image.acoustics, s, 0.1 * i, 0.1) for i, s in enumerate(stamps)]
     bag = write_run(tmp_path / "sectors", None, track, sectors=sectors)
     nodes = whole_graph(graph, bag, method="soft")
     graph.spin_until(complete(nodes["carver"]))
@@ -412,10 +413,11 @@ def test_a_killed_recorder_is_followed_by_one_that_keeps_what_was_recorded(
     recorder = graph.add(BagRecorderNode, out=str(out))
     player = graph.add(BagPlayerNode, bag=bag, rate=0.0, min_sinks=1)
     graph.spin_until(lambda: recorder.counts["integrated"] >= 12)
-    recorder.writer.flush()
+    writer = recorder._bags[-1].writer
+    writer.flush()
     lock, recorder._lock = recorder._lock, None  # what the operating system does with a dead process' lock
     lock.close()
-    recorder.writer._stream.close()
+    writer._stream.close()
     graph.kill(recorder)
     sent = player.counts["sent"]
     graph.add(BagRecorderNode, out=str(out))
