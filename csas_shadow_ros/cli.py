@@ -19,6 +19,7 @@ from .core.errors import CsasError, ParameterError
 from .core.parameters import STAGES, PipelineParameters
 
 PROGRAM = "csas-shadow"
+ALL_RUNS = "all"
 OK, FAILED, USAGE = 0, 1, 2
 #: Shadows may leave the image by so much of its half side before a simulation is said to be too small.
 _MAX_REACH = 1.6
@@ -172,13 +173,46 @@ def parameters_of(arguments: argparse.Namespace) -> PipelineParameters:
     return pipeline_parameters(values)
 
 
-def _run_option(parser: argparse.ArgumentParser) -> None:
+def _run_option(parser: argparse.ArgumentParser, *, each: bool = False) -> None:
+    every = "; all: each, into folders DIR/run_1, DIR/run_2, …" if each else ""
     parser.add_argument(
         "--run",
-        type=int,
+        type=_run_or_all if each else int,
         metavar="N",
         help="which of the bag's runs: its number in time from 1, or its name, the stamp (ns) of its track's"
-        " first pose (the first one that has an image or sectors)",
+        f" first pose{every} (the first one that has an image or sectors)",
+    )
+
+
+def _run_or_all(text: str) -> int | str:
+    return text if text == ALL_RUNS else int(text)
+
+
+def _runs_and_folders(arguments: argparse.Namespace) -> list[tuple[int | None, Path]]:
+    """Return which runs of the bag are asked for, and the results folder of each."""
+    from .bags import read_run
+
+    out = Path(arguments.out)
+    if arguments.run != ALL_RUNS:
+        return [(arguments.run, out)]
+    names = read_run(arguments.bag, arguments.namespace).run_names
+    if not names:
+        raise ParameterError(
+            f"--run is {ALL_RUNS!r}, but no track of {arguments.bag} names a run; expected none"
+        )
+    return [(number, out / f"run_{number}") for number in range(1, len(names) + 1)]
+
+
+def _bounded_objects(parser: argparse.ArgumentParser) -> None:
+    from .core.parameters import MAX_OBJECTS, MOST_OBJECTS
+
+    parser.add_argument(
+        "--max-objects",
+        type=int,
+        default=MAX_OBJECTS,
+        metavar="N",
+        help="bodies of a scene that are carved, the target among them; the target's result does not depend"
+        f" on it (1 to {MOST_OBJECTS}; default {MAX_OBJECTS})",
     )
 
 
@@ -416,12 +450,11 @@ def _add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _run_options(p: argparse.ArgumentParser) -> None:
-    from .core.parameters import MAX_OBJECTS, MOST_OBJECTS
     from .process import START_FROM
 
     p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
     p.add_argument("--namespace", help="namespace of its topics (found by itself)")
-    _run_option(p)
+    _run_option(p, each=True)
     p.add_argument(
         "--start-from",
         choices=START_FROM,
@@ -436,14 +469,7 @@ def _run_options(p: argparse.ArgumentParser) -> None:
         help="instead of the one that the bag states",
     )
     p.add_argument("--workers", type=int, default=2, metavar="N", help="threads (default 2)")
-    p.add_argument(
-        "--max-objects",
-        type=int,
-        default=MAX_OBJECTS,
-        metavar="N",
-        help="bodies of an image that are carved, the target among them; the target's result does not depend"
-        f" on it (1 to {MOST_OBJECTS}; default {MAX_OBJECTS})",
-    )
+    _bounded_objects(p)
     _results_options(p)
     _parameter_options(p)
     _common(p)
@@ -477,6 +503,8 @@ def _replay_options(p: argparse.ArgumentParser) -> None:
         metavar="R",
         help="views: times the recorded speed; 0: as fast as the nodes take them (default 0)",
     )
+    _run_option(p, each=True)
+    _bounded_objects(p)
     _results_options(p)
     _parameter_options(p)
     _common(p)
@@ -707,53 +735,58 @@ def _run(arguments: argparse.Namespace, console: Console) -> int:
     parameters = parameters_of(arguments)
     if arguments.workers < 1:
         raise ParameterError(f"workers is {arguments.workers}; expected 1 or more")
-    with console.bar("views") as bar:
-        report = process_bag(
-            arguments.bag,
-            arguments.out,
-            parameters,
-            start_from=arguments.start_from,
-            spectrum_sign=arguments.spectrum_sign,
-            namespace=arguments.namespace,
-            run_of_bag=arguments.run,
-            overwrite=arguments.overwrite,
-            write_bag=not arguments.no_bag,
-            figures=not arguments.no_figures,
-            workers=arguments.workers,
-            max_objects=arguments.max_objects,
-            command=arguments.command_line,
-            progress=bar,
-            notice=console.notice,
-        )
-    _give_report(arguments, console, report)
+    for number, out in _runs_and_folders(arguments):
+        with console.bar("views") as bar:
+            report = process_bag(
+                arguments.bag,
+                out,
+                parameters,
+                start_from=arguments.start_from,
+                spectrum_sign=arguments.spectrum_sign,
+                namespace=arguments.namespace,
+                run_of_bag=number,
+                overwrite=arguments.overwrite,
+                write_bag=not arguments.no_bag,
+                figures=not arguments.no_figures,
+                workers=arguments.workers,
+                max_objects=arguments.max_objects,
+                command=arguments.command_line,
+                progress=bar,
+                notice=console.notice,
+            )
+        _give_report(console, out, report)
     return OK
 
 
-def _give_report(arguments: argparse.Namespace, console: Console, report: dict[str, Any]) -> None:
+def _give_report(console: Console, out: Path, report: dict[str, Any]) -> None:
     from .results import summary
 
-    console.result(f"{summary(report)}results: {arguments.out}", report)
+    console.result(f"{summary(report)}results: {out}", report)
 
 
 def _replay(arguments: argparse.Namespace, console: Console) -> int:
     from .process import replay_bag
 
     parameters = parameters_of(arguments)
-    with console.bar("views") as bar:
-        report = replay_bag(
-            arguments.bag,
-            arguments.out,
-            parameters,
-            start_from=arguments.start_from,
-            rate=arguments.rate,
-            overwrite=arguments.overwrite,
-            write_bag=not arguments.no_bag,
-            figures=not arguments.no_figures,
-            command=arguments.command_line,
-            progress=bar,
-            notice=console.notice,
-        )
-    _give_report(arguments, console, report)
+    arguments.namespace = None
+    for number, out in _runs_and_folders(arguments):
+        with console.bar("views") as bar:
+            report = replay_bag(
+                arguments.bag,
+                out,
+                parameters,
+                start_from=arguments.start_from,
+                rate=arguments.rate,
+                run_of_bag=number,
+                max_objects=arguments.max_objects,
+                overwrite=arguments.overwrite,
+                write_bag=not arguments.no_bag,
+                figures=not arguments.no_figures,
+                command=arguments.command_line,
+                progress=bar,
+                notice=console.notice,
+            )
+        _give_report(console, out, report)
     return OK
 
 

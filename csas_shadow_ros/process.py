@@ -126,6 +126,7 @@ def replay_bag(
     *,
     start_from: str = "auto",
     rate: float = 0.0,
+    run_of_bag: int | None = None,
     max_objects: int = MAX_OBJECTS,
     overwrite: bool = False,
     write_bag: bool = True,
@@ -138,7 +139,8 @@ def replay_bag(
 
     Parameters
     ----------
-    bag, out, parameters, start_from, max_objects, overwrite, write_bag, figures, command, progress, notice
+    bag, out, parameters, start_from, run_of_bag, max_objects, overwrite, write_bag, figures, command
+    progress, notice
         See `process_bag`.
     rate : float
         Views: times the recorded speed; 0: as fast as the nodes take them.
@@ -167,7 +169,7 @@ def replay_bag(
     p = parameters or PipelineParameters()
     with ResultsWriter(out, overwrite=overwrite, bag=write_bag, figures=figures) as writer:
         began = time.perf_counter()
-        run = read_run(bag)
+        run = read_run(bag, None, run_of_bag)
         context = Context(p, command, truth=read_truth(bag))
         image = None
         stage = start_from
@@ -187,7 +189,10 @@ def replay_bag(
             rate=rate,
             record=True,
             max_objects=max_objects,
-            overrides={"bag_recorder": {"compression": "lz4"}},
+            overrides={
+                "bag_recorder": {"compression": "lz4"},
+                "bag_player": {} if run.run_ns is None else {"run": run.run_ns},
+            },
             progress=progress or False,
             notice=notice,
         )
