@@ -228,8 +228,10 @@ class _Watcher:
         except CsasError:
             return  # an outside node's; the graph's own are well-formed
         if isinstance(item, Heartbeat):
-            if item.values.get("leaving") != "true" and item.instance not in self._dead:
-                stream = item.values.get("stream", item.values.get("input", ""))
+            stream = item.values.get("stream", item.values.get("input", ""))
+            if item.values.get("leaving") == "true":
+                self.beats.pop((item.node, stream), None)
+            elif item.instance not in self._dead:
                 self.beats[item.node, stream] = item
             if text := item.values.get("error"):
                 self.errors[item.node] = text

@@ -31,7 +31,7 @@ from .geometry import View, ViewInfo
 from .parameters import CarvingParameters
 from .seabed import SeabedSlope, seabed_slope, shadow_end
 from .threads import in_order
-from .threshold import least_views_fraction, thresholded
+from .threshold import LEAST_VOXELS, least_threshold, least_views_fraction, thresholded
 from .volume import Volume, VoxelGrid
 
 #: l_out is accumulated in steps of 1/4096, far below the spread of its estimate.
@@ -485,6 +485,21 @@ class Carver:
     def likelihood(self) -> NDArray[np.float32]:
         """Return the mean of l_out (masks: the fraction of views that contradict the voxel); NaN unknown."""
         return _mean(self._sums.total, self._sums.count, self.parameters, len(self.stamps))
+
+    def hopeless(self, most_views: int) -> bool:
+        """Say whether no object can be left any more, even if no further view contradicts a voxel.
+
+        Parameters
+        ----------
+        most_views : int
+            So many views will be integrated in all, at most.
+        """
+        threshold = least_threshold(self.parameters)
+        if threshold is None:
+            return False
+        # A sum only grows, and is divided by as many views at most.
+        limit = threshold * max(most_views, len(self.stamps)) * _SCALE
+        return int(np.count_nonzero(self._sums.total < limit)) < LEAST_VOXELS
 
     def grid(self) -> VoxelGrid:
         """Threshold what has been carved so far.

@@ -12,8 +12,11 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from .arcs import Arc, Arcs
 from .carving import Carver, KeptMask
@@ -27,7 +30,7 @@ from .mesh import Dimensions, measure, mesh_from_grid
 from .parameters import PipelineParameters
 from .search.decision import Decision
 from .segmentation import require_silhouette
-from .shape.pieces import objects_of
+from .shape.pieces import NOTHING_LEFT, objects_of
 from .shape.result import LeftOut, ObjectResult, Result, ViewEvidence
 from .shape.verdict import judge
 from .threads import in_order
@@ -42,6 +45,9 @@ Item = TypeVar("Item", float, View)
 
 #: What of a view can be taken in: by which the target is carved, measured, and its hollows told.
 PARTS = ("likelihood", "mask", "levels", "sides", "look")
+#: So often (views) it is looked whether a further body can still be an object: looking costs about as much
+#: as carving it with one view.
+_LOOK_EVERY = 16
 #: Views that wait for their silhouette at most, where it comes apart from them: twice the largest window.
 _WAITING = 16
 
@@ -78,6 +84,8 @@ class Body:
         self.looks: dict[int, EchoLook] = {}
         #: Why the first view that was not usable was not.
         self.refused = ""
+        #: Nothing can be left of it any more: it takes no further views.
+        self.given_up = False
         self._masks: dict[int, KeptMask] = {}
         self._waiting: OrderedDict[int, Levels] = OrderedDict()
 
@@ -145,22 +153,15 @@ class Body:
         return [s for stamp, s in sorted(self.sides.items()) if s is not None and stamp in self.carver.stamps]
 
 
-@dataclass(frozen=True, eq=False)
-class _Shape:
-    """What a body's views say together."""
-
-    grid: VoxelGrid
-    mesh: trimesh.Trimesh | None
-    dimensions: Dimensions | None
-
-
-def _shape_of(grid: VoxelGrid, sides: Sequence[SilhouetteSides], *, final: bool) -> _Shape:
+def _measured(
+    grid: VoxelGrid, sides: Sequence[SilhouetteSides], *, final: bool
+) -> tuple[trimesh.Trimesh | None, Dimensions | None]:
     """Extract a grid's surface and measure it; with intervals once no more views are to come."""
     if not grid.occupied.any():
-        return _Shape(grid, None, None)
+        return None, None
     mesh = mesh_from_grid(grid)
     found = measure_object(grid, mesh, sides) if final else measure(mesh)
-    return _Shape(grid, mesh, found.rounded(grid.volume.voxel_size_m))
+    return mesh, found.rounded(grid.volume.voxel_size_m)
 
 
 class Reconstruction:
@@ -202,6 +203,8 @@ class Reconstruction:
         self.rejected: dict[float, str] = {}
         self.composites: Composites | None = None
         self.timings_s: dict[str, float] = {}
+        #: How many views there will be at most; 0: nobody knows.
+        self.most_views = 0
         self._compose = compose
 
     @property
@@ -222,7 +225,13 @@ class Reconstruction:
         ViewError
             If the body's grid cannot take it.
         """
-        fresh = self.bodies[body].add(view, parts)
+        own = self.bodies[body]
+        if own.given_up:
+            return False
+        fresh = own.add(view, parts)
+        if body and fresh and self.most_views and len(own.carver.stamps) % _LOOK_EVERY == 0:
+            own.given_up = own.carver.hopeless(self.most_views)
+            return True
         pixels = view.mask if "mask" in parts else view.likelihood
         if fresh and body == 0 and pixels is not None:
             half = pixels.info.aperture_rad / 2.0
@@ -268,6 +277,7 @@ class Reconstruction:
             How many items there were.
         """
         began = time.perf_counter()
+        self.most_views = total
 
         def ready(item: Item) -> list[ProcessedView | ViewError] | ViewError:
             try:
@@ -293,7 +303,7 @@ class Reconstruction:
 
     def _made_or_not(self, number: int, view: ProcessedView) -> ProcessedView | ViewError:
         try:
-            return _made(view, self.parts_of(number))
+            return _made(view, () if self.bodies[number].given_up else self.parts_of(number))
         except ViewError as error:
             return error
 
@@ -354,35 +364,39 @@ class Reconstruction:
             timings_s=dict(self.timings_s),
         )
         if self.stamps:
-            self._shape(result, self.bodies[0], final=final)
-        result.timings_s["shape"] = time.perf_counter() - began
-        if final and result.mesh is not None and result.looks:
-            self._open_hollows(result)
-        result.timings_s["hollows"] = time.perf_counter() - began - result.timings_s["shape"]
+            body = self.bodies[0]
+            result.grid = body.carver.grid() if final else body.carver.first_look()
+            result.timings_s["carve"] = time.perf_counter() - began
+            if not final:
+                result.mesh, result.dimensions = _measured(result.grid, (), final=False)
+            else:
+                looks = _over_seabed(result.grid, body.looks.values())
+                result.looks = {look.info.stamp_ns: look for look in looks}
+                with ThreadPoolExecutor(1) as pool:  # hollows and measures do not depend on each other
+                    matter = pool.submit(matter_of, result.grid, result.looks.values())
+                    self._measure(result, body)
+                    self._open_hollows(result, matter.result())
+                result.timings_s["shape"] = time.perf_counter() - began - result.timings_s["carve"]
         if final and len(self.bodies) > 1:
+            since = time.perf_counter()
             for body in self.bodies[1:]:
                 self._add_objects(result, body)
-            result.timings_s["objects"] = time.perf_counter() - began - sum(
-                result.timings_s[step] for step in ("shape", "hollows")
-            )
+            result.timings_s["objects"] = time.perf_counter() - since
         judge(result)
         return result
 
-    def _shape(self, result: Result, body: Body, *, final: bool) -> None:
-        """Give the result the target's grid, surface and measures, and what each view told."""
-        grid = body.carver.grid() if final else body.carver.first_look()
-        sides = _over_seabed(grid, body.known_sides()) if final else []
-        shape = _shape_of(grid, sides, final=final)
-        result.grid, result.mesh, result.dimensions = grid, shape.mesh, shape.dimensions
-        if not final:
+    @staticmethod
+    def _measure(result: Result, body: Body) -> None:
+        """Give the result the target's surface and measures, and what each view told."""
+        if result.grid is None:
             return
+        result.sides = _over_seabed(result.grid, body.known_sides())
+        result.mesh, result.dimensions = _measured(result.grid, result.sides, final=True)
         if body.other is not None and body.other.stamps:
             result.other_grid = body.other.grid()
-        result.sides = sides
-        result.looks = {look.info.stamp_ns: look for look in _over_seabed(grid, body.looks.values())}
         heights = {}
-        if shape.dimensions is not None:
-            heights = {side.info.stamp_ns: shadow_height(side, shape.dimensions) for side in sides}
+        if (found := result.dimensions) is not None:
+            heights = {side.info.stamp_ns: shadow_height(side, found) for side in result.sides}
         for stamp, info in sorted(body.infos.items()):
             level, contrast, estimated = body.levels.get(stamp, (math.nan, math.nan, False))
             x, y, z = map(float, info.camera.sonar_m)
@@ -391,18 +405,21 @@ class Reconstruction:
             )
 
     @staticmethod
-    def _open_hollows(result: Result) -> None:
+    def _open_hollows(result: Result, matter: NDArray[np.bool_]) -> None:
         """Tell the matter in a result's grid from hollows that no shadow shows; the grid stays as it is."""
-        if result.grid is None:
+        if result.grid is None or result.mesh is None or not result.looks:
             return
-        result.matter = matter_of(result.grid, result.looks.values())
-        hollow = bool((result.grid.occupied & ~result.matter).any())
-        result.matter_mesh = matter_mesh(result.grid, result.matter) if hollow else result.mesh
+        result.matter = matter
+        hollow = bool((result.grid.occupied & ~matter).any())
+        result.matter_mesh = matter_mesh(result.grid, matter) if hollow else result.mesh
 
     @staticmethod
     def _add_objects(result: Result, body: Body) -> None:
         """Add what a further body turned out to be, without what was reported before it."""
         place = body.target.position_m
+        if body.given_up:
+            result.left_out.append(LeftOut(place, NOTHING_LEFT))
+            return
         if not body.carver.stamps:
             result.left_out.append(LeftOut(place, f"no view of it was usable: {body.refused}"))
             return
@@ -412,13 +429,14 @@ class Reconstruction:
         for grid in found:
             # Silhouettes are those of the whole body: they measure a piece only where it is all of it.
             alone = grid is whole
-            shape = _shape_of(grid, _over_seabed(grid, body.known_sides()) if alone else [], final=True)
+            sides = _over_seabed(grid, body.known_sides()) if alone else []
+            mesh, dimensions = _measured(grid, sides, final=True)
             target, box = body.target, grid.volume
             if not alone:
                 target = Target((box.centre_m[0], box.centre_m[1]), box.size_m)
-            if shape.mesh is not None and shape.dimensions is not None:
+            if mesh is not None and dimensions is not None:
                 views = len(body.carver.stamps)
-                result.further.append(ObjectResult(target, grid, shape.mesh, shape.dimensions, views))
+                result.further.append(ObjectResult(target, grid, mesh, dimensions, views))
 
 
 def _made(view: ProcessedView, parts: Collection[str]) -> ProcessedView:

@@ -62,6 +62,13 @@ def object_threshold(likelihood: NDArray[np.float32], method: str) -> float:
     return _CONSENSUS if method == "consensus" else _HARD
 
 
+def least_threshold(parameters: CarvingParameters) -> float | None:
+    """Return the threshold that is used whatever the voxels turn out to be; None if it depends on them."""
+    if parameters.threshold:
+        return parameters.threshold
+    return {"consensus": _CONSENSUS, "hard": _HARD}.get(parameters.method)
+
+
 def supported(dark: NDArray[np.bool_], likelihood: NDArray[np.float32], limit: float) -> NDArray[np.bool_]:
     """Extend dark voxels downwards, as objects rest on the seabed.
 

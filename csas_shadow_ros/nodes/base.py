@@ -843,6 +843,7 @@ class Source:
             "lost": len(flow.lost),
             "refused": len(flow.refused),
             "finished": int(flow.finished),
+            "more_to_come": int(flow.more_to_come),
         }
 
     def beat(self, *, leaving: bool) -> Heartbeat:

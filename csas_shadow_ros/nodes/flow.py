@@ -57,6 +57,8 @@ class Peer:
     alive: bool = True
     #: The target that it works for; empty if it needs none.
     target: str = ""
+    #: It has said goodbye: a report that was overtaken by that does not bring it back, a heartbeat does.
+    left: bool = False
 
     @property
     def key(self) -> str:
@@ -188,8 +190,9 @@ class Flow:
         idle = item.values.get("idle") == "true"
         peer = self.peers.setdefault(item.instance, Peer(item.instance, item.node, role, stream, now, False))
         there = not leaving and not idle
-        if idle and isinstance(item, ViewProgress):
-            there = peer.alive  # a kept report tells what was done, not how it stands now
+        peer.left = leaving or (peer.left and isinstance(item, ViewProgress))
+        if isinstance(item, ViewProgress) and (idle or peer.left):
+            there = peer.alive and not peer.left  # a report tells what was done, not how it stands now
         peer.heard_s = now
         peer.target = item.values.get("target", "")
         changed, peer.alive = peer.alive != there, there

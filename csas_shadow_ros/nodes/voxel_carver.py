@@ -197,6 +197,8 @@ class VoxelCarverNode(CsasNode):
         own = beat.values.get("target", self.target.stamp) == self.target.stamp
         if beat.values.get("stream") != "sector" and own:
             self.growing.source_says(self.inlet.instance in beat.values.get("finished_for", "").split())
+            if self.reconstruction is not None and not beat.counts.get("more_to_come", 1):
+                self.reconstruction.most_views = beat.counts.get("total", 0)
 
     # Results
 
@@ -204,6 +206,10 @@ class VoxelCarverNode(CsasNode):
         """Publish what has changed."""
         if not self.active:
             return
+        made = self.reconstruction
+        if self.further is not None and made is not None and all(b.given_up for b in made.bodies[1:]):
+            self.further.close()
+            self.further = None
         before = self.growing.complete
         self.growing.set_rate(self.parameters.publish_hz)
         self.growing.tick(time.monotonic())

@@ -19,6 +19,8 @@ from ..threshold import LEAST_VOXELS
 from ..volume import VoxelGrid
 from .result import LeftOut
 
+#: Why a body is none of which the views leave nothing.
+NOTHING_LEFT = "no voxel of its volume lies in shadow from all sides"
 #: Two carved objects are the same body where they share this much of the smaller one.
 _SAME_BODY = 0.25
 #: Voxels round one of several pieces that were carved in one volume.
@@ -90,7 +92,7 @@ def objects_of(
     """
     pieces = connected_pieces(grid.occupied)
     if not pieces:
-        return [], [LeftOut(place_m, "no voxel of its volume lies in shadow from all sides")]
+        return [], [LeftOut(place_m, NOTHING_LEFT)]
     objects: list[VoxelGrid] = []
     left_out = []
     for piece in pieces:
