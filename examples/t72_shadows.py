@@ -40,8 +40,7 @@ from csas_shadow_ros.core.geometry import (
 )
 from csas_shadow_ros.core.mesh import Dimensions, measure, mesh_from_grid
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters
-from csas_shadow_ros.core.pipeline import Result
-from csas_shadow_ros.core.segmentation import segment_shadow
+from csas_shadow_ros.core.pipeline import ProcessedView, Result
 from csas_shadow_ros.core.stages import run_views
 from csas_shadow_ros.core.volume import VoxelGrid
 from msg_adapters.messages import RosbagsMessages
@@ -186,7 +185,7 @@ def agreement(result: Result, views: list[View]) -> NDArray[np.float64]:
         raise NoTargetError("there is no reconstruction to compare with the views")
     rows = []
     for view in views:
-        mask = segment_shadow(view, result.target.position_m, reach_m=result.target.reach_m).pixels
+        mask = ProcessedView(result.target, PipelineParameters(), shadow=view).require("mask").pixels
         if not (mask == 255).any():
             continue
         drawn = silhouette(result.mesh, view.info.camera)

@@ -13,7 +13,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -373,7 +373,7 @@ class Reconstruction:
                 looks = _over_seabed(result.grid, body.looks.values())
                 result.looks = {look.info.stamp_ns: look for look in looks}
                 with ThreadPoolExecutor(1) as pool:  # hollows and measures do not depend on each other
-                    matter = pool.submit(matter_of, result.grid, result.looks.values())
+                    matter = pool.submit(_timed, result, "hollows", matter_of, result.grid, looks)
                     self._measure(result, body)
                     self._open_hollows(result, matter.result())
                 result.timings_s["shape"] = time.perf_counter() - began - result.timings_s["carve"]
@@ -437,6 +437,14 @@ class Reconstruction:
             if mesh is not None and dimensions is not None:
                 views = len(body.carver.stamps)
                 result.further.append(ObjectResult(target, grid, mesh, dimensions, views))
+
+
+def _timed(result: Result, step: str, work: Callable[..., Any], *args: Any) -> Any:
+    """Note how long a piece of work took."""
+    began = time.perf_counter()
+    done = work(*args)
+    result.timings_s[step] = time.perf_counter() - began
+    return done
 
 
 def _made(view: ProcessedView, parts: Collection[str]) -> ProcessedView:

@@ -467,3 +467,21 @@ def test_every_view_gets_through_a_channel_that_loses_repeats_and_reorders(seed:
             flow.peers[f"voxel_carver-{number - 1}"].alive = False
     assert got == set(range(1, 61))
     assert not flow.lost
+
+
+def test_a_report_that_a_goodbye_has_overtaken_does_not_bring_the_consumer_back() -> None:
+    flow, clock = make_flow(4)
+    staying, leaving = Consumer(flow), Consumer(flow, "voxel_carver_2")
+    flow.look()
+    sent = take_all(flow)
+    leaving.beat(leaving="true")
+    leaving.report(sent[0])
+    flow.look()
+    assert [peer.node for peer in flow.live()] == ["voxel_carver"]
+    for stamp in sent:
+        staying.report(stamp)
+    wait(flow, clock, 5.0, staying)
+    assert flow.finished, "nobody waits for who has left"
+    leaving.beat()
+    assert len(flow.live()) == 2
+    assert not flow.finished, "activated again, it gets what it lacks"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,11 @@ pytest.importorskip("rclpy")
 
 from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M, Graph
 
+from csas_shadow_ros.bags import read_run
 from csas_shadow_ros.core.geometry import Track
 from csas_shadow_ros.core.pipeline import Result, run
 from csas_shadow_ros.nodes import qos
+from csas_shadow_ros.nodes.bag_recorder import BagRecorderNode
 from csas_shadow_ros.nodes.composites import CompositesNode
 from csas_shadow_ros.nodes.shadow_enhancement import ShadowEnhancementNode
 from csas_shadow_ros.nodes.shadow_likelihood import ShadowLikelihoodNode
@@ -184,6 +187,35 @@ def test_three_circles_over_three_contacts_leave_three_results_each_its_own(
     for node in nodes.values():
         assert not node.counts["rejected"], (node.name, dict(node.reasons))
     assert min(nodes["composites"].composites.stamps) >= contacts[2].track.stamps_ns[0]
+
+
+def test_each_run_is_recorded_into_a_bag_of_its_own_that_leaves_the_same_grid_again(
+    graph: Graph, contacts: list[SimulatedRun], alone: list[Result], tmp_path: Path
+) -> None:
+    out = tmp_path / "mission"
+    recorder = graph.add(BagRecorderNode, out=str(out))
+    start_graph(graph)
+    listener, vehicle = Listener(graph), Vehicle(graph)
+    for one, expected in zip(contacts[:2], alone[:2], strict=True):
+        vehicle.send_track(one)
+        vehicle.send_image(one)
+        assert_own(listener, one, expected)
+    recorded = recorder.counts["written"]
+    graph.spin_until(lambda: recorder.counts["in"] >= 2 * 4 * 36, what=f"all views recorded, {recorded} now")
+    recorder.stop()
+    for path, one, expected in zip((out, tmp_path / "mission_2"), contacts[:2], alone[:2], strict=True):
+        bag = read_run(path)
+        assert bag.problems == []
+        assert bag.run_names == (int(one.track.stamps_ns[0]),)
+        assert bag.image is not None
+        assert bag.image.stamp_ns == one.image.stamp_ns
+        assert bag.counts["shadow_mask"] == 36
+        again = run(bag.image, bag.require_track(), PARAMETERS)
+        assert again.grid is not None
+        assert expected.grid is not None
+        np.testing.assert_array_equal(again.grid.likelihood, expected.grid.likelihood)
+        assert again.dimensions == expected.dimensions
+    assert not (tmp_path / "mission_3").exists()
 
 
 @pytest.mark.parametrize("image_first", [True, False])

@@ -1,0 +1,131 @@
+"""One reconstruction, whoever feeds it: in any order, whole views or parts; bodies that are given up."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from csas_shadow_ros.core import pipeline
+from csas_shadow_ros.core.carving import Carver
+from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
+from csas_shadow_ros.core.pipeline import ProcessedView
+from csas_shadow_ros.core.reconstruction import Reconstruction
+from csas_shadow_ros.core.search.decision import Decision
+from csas_shadow_ros.core.shape.verdict import cut_sides
+from csas_shadow_ros.core.volume import Target
+
+COARSE = PipelineParameters(
+    sub_aperture=SubApertureParameters(step_deg=10.0), carving=CarvingParameters(voxel_size_m=0.03)
+)
+
+
+@pytest.fixture(scope="module")
+def whole(box_run):
+    """A run, and its views as they went in."""
+    views = []
+    result = pipeline.run(box_run.image, box_run.track, COARSE, on_view=views.append)
+    return result, views
+
+
+def assert_same(a, b):
+    assert a.dimensions == b.dimensions
+    assert a.verdict == b.verdict
+    assert a.quality == b.quality
+    assert a.evidence == b.evidence
+    assert a.arc_rad == b.arc_rad
+    assert a.grid.seabed == b.grid.seabed
+    for x, y in ((a.grid, b.grid), (a.other_grid, b.other_grid)):
+        assert np.array_equal(x.likelihood, y.likelihood, equal_nan=True)
+        assert np.array_equal(x.occupied, y.occupied)
+    assert np.array_equal(a.matter, b.matter)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_order_of_views_changes_nothing(whole, seed):
+    result, views = whole
+    again = Reconstruction(replace(result.decision, others=()), COARSE, run_ns=result.run_ns)
+    shuffled = random.Random(seed).sample(views, len(views))
+    for view in shuffled:
+        assert again.add(view)
+    assert_same(again.result(), result)
+
+
+@pytest.mark.parametrize("first", ["mask", "shadow"])
+def test_parts_of_a_view_that_come_one_by_one_leave_what_whole_views_leave(whole, first):
+    result, views = whole
+    again = Reconstruction(replace(result.decision, others=()), COARSE, run_ns=result.run_ns)
+    target = result.target
+    for view in views:
+        parts = [
+            (ProcessedView(target, COARSE, shadow_mask=view.mask), ("mask",)),
+            (ProcessedView(target, COARSE, likelihood=view.likelihood), ("likelihood",)),
+            (ProcessedView(target, COARSE, shadow=view.shadow), ("levels", "look")),
+        ]
+        for piece, names in parts if first == "mask" else parts[::-1]:
+            again.add(piece, parts=names)
+    assert_same(again.result(), result)
+
+
+def test_a_view_that_comes_again_changes_nothing(whole):
+    result, views = whole
+    again = Reconstruction(replace(result.decision, others=()), COARSE, run_ns=result.run_ns)
+    for view in (*views, *views[:5]):
+        again.add(view)
+    assert_same(again.result(), result)
+    assert not again.add(views[0])
+
+
+def test_silhouettes_alone_are_measured_by_themselves(whole):
+    result, views = whole
+    alone = Reconstruction(Decision(result.target), COARSE, compare=False, compose=False)
+    for view in views:
+        alone.add(ProcessedView(result.target, COARSE, shadow_mask=view.mask), parts=("mask",))
+    found = alone.result()
+    assert np.array_equal(found.grid.occupied, result.grid.occupied)
+    assert found.matter is None
+    assert found.dimensions.length_m == pytest.approx(result.dimensions.length_m, abs=0.03)
+
+
+def test_a_body_is_given_up_only_where_nothing_can_be_left_of_it(whole):
+    result, views = whole
+    empty = Target((0.5, 0.45), (0.2, 0.2, 0.2))
+    nothing, object_ = (Carver(t.volume(0.03), COARSE.carving) for t in (empty, result.target))
+    given_up = None
+    for count, view in enumerate(views, start=1):
+        for carver in (nothing, object_):
+            carver.integrate(view.mask)
+        if given_up is None and nothing.hopeless(len(views)):
+            given_up = count
+        assert not object_.hopeless(len(views))
+    assert given_up is not None
+    assert given_up < len(views)
+    assert not nothing.grid().occupied.any(), "as was foretold"
+    # The more views may still come, the more must contradict.
+    assert not nothing.hopeless(100 * len(views))
+
+
+def test_a_volume_that_cuts_the_object_is_told(whole):
+    result, views = whole
+    x, y, z = result.target.size_m
+    small = replace(result.target, size_m=(0.3 * x, y, z))
+    cut = Reconstruction(Decision(small), COARSE)
+    for view in views:
+        cut.add(ProcessedView(small, COARSE, shadow=view.shadow))
+    found = cut.result()
+    assert cut_sides(result.grid) == []
+    assert result.quality.verdict == "good"
+    assert {"west side", "east side"} <= set(cut_sides(found.grid))
+    assert found.quality.verdict == "not trustworthy"
+    assert any("cuts the object" in reason for reason in found.quality.reasons)
+
+
+def test_without_a_usable_view_the_answer_is_undecided(whole):
+    nothing = Reconstruction(Decision(whole[0].target), COARSE)
+    nothing.refuse(0.0, "too dark")
+    found = nothing.result()
+    assert found.verdict == "undecided"
+    assert "too dark" in found.quality.reasons[0]
+    assert Reconstruction(Decision(None), COARSE).result().verdict == "no object"
