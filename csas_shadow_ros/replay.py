@@ -581,10 +581,16 @@ def _collect(
         got = watcher.latest
         if wanted <= set(got):
             further = set(topics_of_result(got["measurements"]))
-            if further <= set(got):
+            if not further <= set(got):
+                wanted |= further
+                continue
+            beats = [b for (node, _), b in watcher.beats.items() if node == "bag_recorder"]
+            held = max((b.counts.get("result_topics", 0) for b in beats), default=len(further))
+            if held >= len(further):
                 return got
-            wanted |= further
-            continue
+            if time.monotonic() - since > _COLLECT_S:
+                tell(f"the recording holds {held} of the {len(further)} topics of the result")
+                return got
         watcher.spin(0.01)
         graph.watch()
         if len(graph.deaths) > dead:

@@ -119,7 +119,7 @@ class Dimensions:
         image that they are of would differ in digits that nobody measured. Ten times finer, one value in 10⁴
         would still differ; ten times coarser, the digits would begin to matter beside the interval.
         """
-        digits = -math.floor(math.log10(voxel_size_m / 100.0))
+        digits = digits_of(voxel_size_m)
 
         def length(value: float) -> float:
             return round(value, digits) + 0.0
@@ -139,6 +139,11 @@ class Dimensions:
             hull_top_m=length(self.hull_top_m),
             intervals={name: (of(name, low), of(name, high)) for name, (low, high) in self.intervals.items()},
         )
+
+
+def digits_of(voxel_size_m: float) -> int:
+    """Return the decimals of the power of ten (m) that is at most a hundredth of a voxel."""
+    return -math.floor(math.log10(voxel_size_m / 100.0))
 
 
 def measure(mesh: trimesh.Trimesh) -> Dimensions:

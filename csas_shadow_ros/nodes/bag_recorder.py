@@ -15,7 +15,7 @@ from csas_shadow_ros.bags import BagReader, BagWriter
 from csas_shadow_ros.core.errors import BagError, ParameterError
 from csas_shadow_ros.core.geometry.runs import TrackBook
 from msg_adapters import STREAMS, TOPICS, message_from_cdr, track_piece_from_msg
-from msg_adapters.topics import absolute_name, is_latched, is_topic, split_prefix
+from msg_adapters.topics import RESULT_TOPICS, absolute_name, is_latched, is_topic, split_prefix
 from msg_adapters.topics import topic as topic_of
 
 from . import qos
@@ -287,18 +287,23 @@ class BagRecorderNode(CsasNode):
         bag = self._bags[-1]
         return {"bag": str(bag.path)} | ({} if bag.run_ns is None else {"run": str(bag.run_ns)})
 
+    def state_counts(self) -> dict[str, int]:
+        """Return of how many topics of a result the newest bag has messages."""
+        seen = {topic for topic, _, _ in self._bags[-1].seen} if self._bags else set()
+        return {"result_topics": sum(split_prefix(topic)[1] in RESULT_TOPICS for topic in seen)}
+
     def tick(self) -> None:
         """See to it that a crash costs little; record further objects' topics as they appear."""
         if self._bags and time.monotonic() - self._flushed_s > _FLUSH_S:
             self._flushed_s = time.monotonic()
             for bag in self._bags:
                 bag.writer.flush()
-            if self._all:
-                prefix = f"{absolute_name('', self.get_namespace()).rstrip('/')}/"
-                for name, _ in self.get_topic_names_and_types():
-                    relative = name.removeprefix(prefix)
-                    if relative != name and split_prefix(relative)[0] and is_topic(relative):
-                        self._record(relative)
+        if self._bags and self._all:
+            prefix = f"{absolute_name('', self.get_namespace()).rstrip('/')}/"
+            for name, _ in self.get_topic_names_and_types():
+                relative = name.removeprefix(prefix)
+                if relative != name and split_prefix(relative)[0] and is_topic(relative):
+                    self._record(relative)
 
     def finish(self) -> None:
         """Finish the bags: their metadata come last, and at once."""

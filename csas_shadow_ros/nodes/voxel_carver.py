@@ -24,7 +24,7 @@ from csas_shadow_ros.core.shape.result import Result
 from csas_shadow_ros.core.warm import warm_carving
 from msg_adapters import Heartbeat, result_to_msgs, view_from_msgs
 from msg_adapters.measurements import numbered_objects
-from msg_adapters.topics import RESULT_TOPICS
+from msg_adapters.topics import OTHER_METHOD, PREFIXED_TOPICS, RESULT_TOPICS, object_prefix, prefixed
 
 from . import qos
 from .base import INTEGRATED, CsasNode, Inlet, TargetInlet, run_node
@@ -55,6 +55,8 @@ class VoxelCarverNode(CsasNode):
         self.outlets: dict[str, Publisher] = {}
         for name in RESULT_TOPICS:
             self.outlet(name)
+        if p.compare:
+            self.open_outlets(OTHER_METHOD)
         self.pipeline = PipelineParameters(
             carving=part(p, CarvingParameters),
             likelihood=part(p, LikelihoodParameters),
@@ -96,6 +98,11 @@ class VoxelCarverNode(CsasNode):
             self.outlets[name] = self.publisher(name, qos.LATCHED)
         return self.outlets[name]
 
+    def open_outlets(self, prefix: str) -> None:
+        """Make the publishers of another grid early: who records has to find them before they are used."""
+        for name in PREFIXED_TOPICS:
+            self.outlet(prefixed(prefix, name))
+
     # Which target, and which run
 
     def hold(self, stamp: int) -> tuple[str, float]:
@@ -111,6 +118,8 @@ class VoxelCarverNode(CsasNode):
     def on_target(self) -> None:
         """Take views for the further bodies, if there are any."""
         wanted = bool(self.target.decision.others)
+        for number in range(2, len(self.target.decision.others) + 2):
+            self.open_outlets(object_prefix(number))
         if wanted and self.further is None:
             self.further = self.inlet_of("sub_aperture", optional=True)
             self.tell_now()
