@@ -74,6 +74,8 @@ class RunBag:
     run_ns: int | None = None
     #: What is in it: (topic, stamp, checksum where messages of a stamp may differ).
     seen: set[tuple[str, int, int]] = field(default_factory=set)
+    #: Topics of a result that it has messages of.
+    results: set[str] = field(default_factory=set)
 
 
 class BagRecorderNode(CsasNode):
@@ -259,6 +261,8 @@ class BagRecorderNode(CsasNode):
             )
             bag.writer.write(name, cdr, when)
             self.counts["written"] += 1
+            if split_prefix(topic)[1] in RESULT_TOPICS:
+                bag.results.add(topic)
             if topic not in _NEVER_ALIKE:
                 bag.seen.add(key)
         if flow is not None and stamp is not None:
@@ -289,8 +293,9 @@ class BagRecorderNode(CsasNode):
 
     def state_counts(self) -> dict[str, int]:
         """Return of how many topics of a result the newest bag has messages."""
-        seen = {topic for topic, _, _ in self._bags[-1].seen} if self._bags else set()
-        return {"result_topics": sum(split_prefix(topic)[1] in RESULT_TOPICS for topic in seen)}
+        # Heartbeats ask from a thread of their own: a length can be read while the set grows.
+        bags = self._bags[-1:]
+        return {"result_topics": len(bags[0].results) if bags else 0}
 
     def tick(self) -> None:
         """See to it that a crash costs little; record further objects' topics as they appear."""
