@@ -21,6 +21,7 @@ from msg_adapters.topics import topic as topic_of
 from . import qos
 from .base import INTEGRATED, CsasNode, Inlet, run_node
 from .playing import message_stamp, recorded_streams, topics_to_record
+from .runtime.runs import HOLD_S
 
 #: Topics of messages that differ though they carry the same stamp.
 _NEVER_ALIKE = frozenset({"progress", "/diagnostics"})
@@ -28,6 +29,9 @@ _NEVER_ALIKE = frozenset({"progress", "/diagnostics"})
 _ENDS_THE_RUN_BEFORE = frozenset({"measurements", "voxel_grid/image"})
 #: Bags of one recorder, at most.
 _MOST_RUNS = 10_000
+#: What begins a run, and may come before its track; so many such messages wait for it at most.
+_BEGIN_A_RUN = frozenset({"image", "camera_info", "sector/image", "sector/camera_info"})
+_MOST_UNPLACED = 16
 _FLUSH_S = 1.0
 
 
@@ -104,6 +108,8 @@ class BagRecorderNode(CsasNode):
         #: Tracks of runs of which nothing else has come yet: (when, message), a run.
         self._tracks: dict[int, list[tuple[int, bytes]]] = {}
         self._over: set[int] = set()
+        #: Images and sectors whose stamp no track covers yet: (since, topic, message).
+        self._unplaced: list[tuple[float, str, bytes]] = []
         self._flushed_s = 0.0
         self._open(Path(p.out))
         self.inlets.extend(dict.fromkeys(inlet for inlet, _ in self._flows.values()))
@@ -186,7 +192,17 @@ class BagRecorderNode(CsasNode):
                 self._tracks.setdefault(after, []).extend(self._tracks.pop(before))
         return name
 
-    def _take(self, topic: str, cdr: bytes) -> None:
+    def _place_again(self, patience_s: float = HOLD_S) -> None:
+        """Write what waits for its track, as far as it has come, or it has waited long enough."""
+        held, self._unplaced = self._unplaced, []
+        for since_s, topic, cdr in held:
+            late = time.monotonic() - since_s > patience_s
+            if late or self._book.run_of(message_stamp(cdr, topic) or 0) is not None:
+                self._take(topic, cdr, late=late)
+            else:
+                self._unplaced.append((since_s, topic, cdr))
+
+    def _take(self, topic: str, cdr: bytes, *, late: bool = False) -> None:
         """Write a message into the bag of the run that its stamp is of."""
         when = time.time_ns()
         if not self._bags:
@@ -201,9 +217,14 @@ class BagRecorderNode(CsasNode):
                     self._write(bag, topic, cdr, when)
                     return
             self._tracks.setdefault(name, []).append((when, cdr))
+            self._place_again()
             return
         stamp = None if topic in _NEVER_ALIKE else message_stamp(cdr, topic)
         run_ns = None if stamp is None else self._book.run_of(stamp)
+        if run_ns is None and topic in _BEGIN_A_RUN and self._book.names and not late:
+            # It may have overtaken its track.
+            self._unplaced = [*self._unplaced[1 - _MOST_UNPLACED :], (time.monotonic(), topic, cdr)]
+            return
         if run_ns in self._over:
             raise BagError(f"{topic} of the run of {run_ns} ns came after its bag was finished; not recorded")
         for bag in self._bags:
@@ -303,6 +324,7 @@ class BagRecorderNode(CsasNode):
             self._flushed_s = time.monotonic()
             for bag in self._bags:
                 bag.writer.flush()
+        self._place_again()
         if self._bags and self._all:
             prefix = f"{absolute_name('', self.get_namespace()).rstrip('/')}/"
             for name, _ in self.get_topic_names_and_types():
@@ -312,6 +334,8 @@ class BagRecorderNode(CsasNode):
 
     def finish(self) -> None:
         """Finish the bags: their metadata come last, and at once."""
+        if self._bags:
+            self._place_again(0.0)
         for bag in list(self._bags):
             self._close_bag(bag)
         if self._lock is not None:
