@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from msg_adapters.topics import absolute_name, stream
 
 from .bags import BagReader, Problem, Run, read_run
 from .bags.check import ERROR, judge_amplitude, judge_coverage, judge_image, judge_sectors
+from .bags.metadata import read_metadata
 from .core.arcs import Arc, Arcs
 from .core.errors import BagError, CsasError, ParameterError, SpectrumSignError
 from .core.geometry import CoherentImage, Track, View, looks_at
@@ -507,11 +507,10 @@ def describe_sectors(run: Run) -> dict[str, Any] | None:
 def _bag_metadata(path: Path) -> dict[str, Any] | None:
     """Return the bag's own metadata without its lists of topics, which are told elsewhere."""
     try:
-        text = (path / "metadata.yaml").read_text(encoding="utf-8")
-        information = yaml.safe_load(text)["rosbag2_bagfile_information"]
-        return {k: v for k, v in information.items() if k not in ("topics_with_message_count", "files")}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError):
+        information = read_metadata(path).information
+    except BagError:
         return None
+    return {k: v for k, v in information.items() if k not in ("topics_with_message_count", "files")}
 
 
 def topic_sizes(run: Run) -> dict[str, int]:

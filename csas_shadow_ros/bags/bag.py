@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
+import weakref
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,18 +14,33 @@ from typing import Any, Literal, NamedTuple
 import yaml
 from mcap.exceptions import McapError
 from mcap.writer import CompressionType, Writer
-from rosbags.rosbag2 import Reader as RosbagsReader
-from rosbags.rosbag2 import ReaderError
 from rosbags.serde import SerdeError
 
 from csas_shadow_ros.core.errors import AdapterError, BagError
 from msg_adapters.messages import message_from_cdr, stamp_to_ns, type_name_of, typestore
-from msg_adapters.topics import NAMESPACE, TOPICS, absolute_name, clean_namespace
+from msg_adapters.topics import NAMESPACE, STREAMS, TOPICS, VIEW_STREAMS, absolute_name, clean_namespace
 
-from .mcap_file import McapFile, TopicType
+from .mcap_file import MAGIC, McapFile
+from .metadata import METADATA, read_metadata
+from .sqlite_file import SQLITE_MAGIC, SqliteFile
+from .storage import (
+    LZ4_MAGIC,
+    ZSTD_MAGIC,
+    StorageFile,
+    TopicType,
+    merged,
+    open_regular,
+    unfold_file,
+    unfold_message,
+)
 
-METADATA = "metadata.yaml"
 _OWN_CHUNK_BYTES = 1 << 18
+_ROS1_MAGIC = b"#ROSBAG "
+#: How storage files end, and what compression of a whole file adds.
+_STORED = (".mcap", ".db3")
+_PACKED = (".zstd", ".zst", ".lz4")
+#: Lines of damage that are kept: who reads more?
+_MOST_PROBLEMS = 200
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 
 
@@ -77,7 +94,9 @@ class BagReader:
     """Reads a rosbag2 directory or a lone storage file.
 
     A bag that was cut off or damaged is read as far as it goes; every damage is one line in
-    `problems`. Use as a context manager or not; files are open only while messages are iterated.
+    `problems`. What the files hold themselves counts, not what ``metadata.yaml`` says of them: MCAP and
+    sqlite3, whole files or messages compressed or not, are told apart by their first bytes. Use as a context
+    manager or not; files are open only while messages are iterated.
 
     Parameters
     ----------
@@ -90,14 +109,22 @@ class BagReader:
     ------
     BagError
         If there is nothing to read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from csas_shadow_ros.bags import BagReader, BagWriter
+    >>> folder = tempfile.mkdtemp()
+    >>> with BagWriter(f"{folder}/bag") as writer:
+    ...     writer.write("/csas/track", bytes(64), 7, type_name="nav_msgs/msg/Path")
+    >>> [(m.topic, m.log_time_ns) for m in BagReader(f"{folder}/bag").messages()]
+    [('/csas/track', 7)]
     """
 
     def __init__(self, path: str | Path, namespace: str | None = None) -> None:
         self.path = Path(path)
-        #: One line for each damage met so far.
-        self.problems: list[str] = []
-        self._files: list[McapFile] = []
-        self._foreign: Path | None = None
+        self._problems: dict[str, None] = {}
+        self._files: list[StorageFile] = []
         #: False if the recording was cut off or a file of it is missing.
         self.complete = True
         if not self.path.exists():
@@ -105,10 +132,11 @@ class BagReader:
         self.topics: dict[str, TopicInfo] = {}
         if self.path.is_dir():
             self._open_directory()
-        elif self.path.suffix == ".db3":
-            self._open_foreign()
         else:
-            self._open_files([self.path])
+            self._files = [self._open_file(self.path)]
+        self.complete &= all(f.complete for f in self._files)
+        for file in self._files:
+            self._add_topics(file)
         self.namespace = clean_namespace(namespace) if namespace is not None else self._find_namespace()
 
     def __enter__(self) -> BagReader:
@@ -116,6 +144,11 @@ class BagReader:
 
     def __exit__(self, *exc: object) -> None:
         return None
+
+    @property
+    def problems(self) -> list[str]:
+        """One line for each damage met so far."""
+        return list(self._problems)
 
     @property
     def message_count(self) -> int:
@@ -130,93 +163,134 @@ class BagReader:
     @property
     def has_checksums(self) -> bool:
         """Whether changed bits would have been noticed in what was read so far."""
-        return self._foreign is None and all(f.has_checksums for f in self._files)
+        return all(f.has_checksums for f in self._files)
 
     @property
     def indexed_files(self) -> list[McapFile] | None:
-        """The bag's MCAP files if all of them have an index; else None."""
-        if self._foreign is not None or not all(f.indexed for f in self._files):
-            return None
-        return list(self._files)
+        """The bag's MCAP files if all of them are complete; else None."""
+        files = [f for f in self._files if isinstance(f, McapFile) and f.complete]
+        return files if len(files) == len(self._files) else None
 
     def _complain(self, problem: str) -> None:
-        if problem not in self.problems:
-            self.problems.append(problem)
+        if len(self._problems) < _MOST_PROBLEMS:
+            self._problems[problem] = None
+        else:
+            self._problems[f"more than {_MOST_PROBLEMS} damages; the others are not listed"] = None
 
     def _open_directory(self) -> None:
-        storages = sorted(self.path.glob("*.mcap"))
-        meta_path = self.path / METADATA
-        if not meta_path.exists():
-            if not storages:
-                raise BagError(
-                    f"{self.path} holds no {METADATA} and no .mcap file; expected a rosbag2 directory"
-                )
-            self.complete = False
-            self._complain(f"{METADATA} is missing (the recording was cut off); reading the .mcap files")
-            self._open_files(storages)
-            return
+        stored = sorted(p for p in self.path.iterdir() if _bare(p.name).endswith(_STORED))
+        # A recorder that is killed while it compresses a file leaves both.
+        names = {p.name for p in stored}
+        stored = [p for p in stored if p.name == _bare(p.name) or _bare(p.name) not in names]
+        wanted, counted = stored, 0
+        if (self.path / METADATA).exists():
+            try:
+                metadata = read_metadata(self.path)
+            except BagError as error:
+                if not stored:
+                    raise BagError(f"{error} and there is no .mcap or .db3 file") from error
+                self._cut(f"{_unplaced(error, self.path)}; reading the storage files")
+            else:
+                wanted, counted = self._listed(metadata.files, stored), metadata.message_count
+        elif stored:
+            self._cut(f"{METADATA} is missing (the recording was cut off); reading the storage files")
+        else:
+            raise BagError(
+                f"{self.path} holds no {METADATA} and no .mcap or .db3 file; expected a rosbag2 directory"
+            )
+        failed: list[BagError] = []
+        for path in wanted:
+            try:
+                self._files.append(self._open_file(path))
+            except BagError as error:
+                failed.append(error)
+        if failed and not self._files:
+            raise failed[0]
+        for refused in failed:
+            self._cut(f"{_unplaced(refused, self.path)}; its messages are lost")
+        found = sum(sum(f.counts.values()) for f in self._files)
+        if found < counted and not self._problems:
+            self._cut(f"{METADATA} tells of {counted} messages; the files hold {found}: the others are lost")
+
+    def _cut(self, problem: str) -> None:
+        self.complete = False
+        self._complain(problem)
+
+    def _listed(self, names: list[str], stored: list[Path]) -> list[Path]:
+        """Return the files that are listed, also where one was (de)compressed since; name what is missing."""
+        there = {p.name: p for p in stored}
+        present: list[Path] = []
+        lost: list[str] = []
+        for name in dict.fromkeys(names):
+            bare = _bare(name)
+            options = [name, bare, *(f"{bare}{packed}" for packed in _PACKED)]
+            found = next(
+                (self.path / o for o in options if o in there or (o and (self.path / o).exists())), None
+            )
+            if found is None:
+                lost.append(name)
+            elif found not in present:
+                present.append(found)
+        if not present and not stored:
+            raise BagError(f"{self.path}: no storage file is there; expected {', '.join(names[:8]) or 'one'}")
+        for name in lost:
+            self._cut(f"{name}, listed in {METADATA}, is missing")
+        return present or stored
+
+    def _open_file(self, path: Path) -> StorageFile:
+        with open_regular(path) as file:
+            start = file.read(len(SQLITE_MAGIC))
+        source, name = path, path.name
+        for compression, magic in (("zstd", ZSTD_MAGIC), ("lz4", LZ4_MAGIC)):
+            if start.startswith(magic):
+                folder = Path(tempfile.mkdtemp(prefix="csas_shadow_bag_"))
+                weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+                source = folder / name.removesuffix(path.suffix)
+                self.complete &= unfold_file(path, compression, source, self._complain)
+                with open_regular(source) as file:
+                    start = file.read(len(SQLITE_MAGIC))
+        if start.startswith(_ROS1_MAGIC):
+            raise BagError(f"{path} is a bag of ROS 1; expected one of ROS 2: rosbags-convert makes one")
         try:
-            info = yaml.safe_load(meta_path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
-            listed = [self.path / Path(name).name for name in info["relative_file_paths"]]
-            storage, mode = info["storage_identifier"], (info.get("compression_mode") or "").lower()
-        except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
-            if not storages:
-                raise BagError(
-                    f"{meta_path} cannot be read ({error!r}) and there is no .mcap file"
-                ) from error
-            self.complete = False
-            self._complain(f"{METADATA} cannot be read ({error!r}); reading the .mcap files")
-            self._open_files(storages)
-            return
-        if storage != "mcap" or mode not in ("", "none"):
-            self._open_foreign()
-            return
-        present = [p for p in listed if p.exists()]
-        for lost in (p for p in listed if not p.exists()):
-            self.complete = False
-            self._complain(f"{lost.name}, listed in {METADATA}, is missing")
-        if not present and not storages:
-            names = ", ".join(p.name for p in listed)
-            raise BagError(f"{self.path}: no storage file is there; expected {names}")
-        self._open_files(present or storages)
+            if start == SQLITE_MAGIC:
+                return SqliteFile(source, self._complain, name)
+            if start and not start.startswith(MAGIC) and ".db3" in path.suffixes:
+                raise BagError(f"cannot read {path}: it is no sqlite3 database (starts with {start[:8]!r})")
+            return McapFile(source, self._complain, name)
+        except BagError as error:
+            raise BagError(str(error).replace(str(source), str(path))) from error
 
-    def _open_files(self, paths: list[Path]) -> None:
-        self._files = [McapFile(p, self._complain) for p in paths]
-        self.complete &= all(f.complete for f in self._files)
-        for file in self._files:
-            for i, channel in file.channels.items():
-                self._add(channel.topic, channel.type_name, (file.counts or {}).get(i, 0))
-
-    def _open_foreign(self) -> None:
-        """Open what rosbags reads and McapFile does not: sqlite3, and compression by file or message."""
-        self._foreign = self.path
-        try:
-            with RosbagsReader(self.path) as reader:
-                for c in reader.connections:
-                    self._add(c.topic, c.msgtype, c.msgcount)
-        except (ReaderError, OSError, KeyError, ValueError) as error:
-            raise BagError(f"cannot read {self.path}: {error}") from error
-
-    def _add(self, topic: str, type_name: str, count: int) -> None:
-        if (known := self.topics.get(topic)) is not None:
-            count += known.count
-            if known.type_name != type_name:
-                self._complain(f"{topic} is recorded as {known.type_name} and as {type_name}")
-                type_name = known.type_name
-        self.topics[topic] = TopicInfo(topic, type_name, count)
+    def _add_topics(self, file: StorageFile) -> None:
+        for i, channel in file.channels.items():
+            topic, type_name, count = channel.topic, channel.type_name, file.counts.get(i, 0)
+            if channel.message_encoding != "cdr":
+                if count:
+                    self._complain(
+                        f"{topic} is encoded as {channel.message_encoding!r}; expected cdr: left out"
+                    )
+                continue
+            if (known := self.topics.get(topic)) is not None:
+                count += known.count
+                if known.type_name != type_name:
+                    self._complain(f"{topic} is recorded as {known.type_name} and as {type_name}")
+                    type_name = known.type_name
+            self.topics[topic] = TopicInfo(topic, type_name, count)
 
     def _find_namespace(self) -> str:
+        """Return the namespace that holds a run; where none holds a whole one, that with most topics."""
         scores: dict[str, int] = {}
         for name in self.topics:
             for relative in TOPICS:
                 if not relative.startswith("/") and name.endswith(f"/{relative}"):
                     prefix = name[: -len(relative) - 1]
                     scores[prefix] = scores.get(prefix, 0) + 1
-        if not scores or NAMESPACE in scores:
+        runs = {prefix: scores[prefix] for prefix in scores if self._holds_run(prefix)}
+        if not scores or (NAMESPACE in scores and not runs):
             return NAMESPACE
+        scores = runs or scores
         best = max(scores.values())
         # Of /a and /a/likelihood with equally many topics, the outer one is the namespace.
-        leaders = sorted((p for p, n in scores.items() if n == best), key=len)
+        leaders = sorted((p for p, n in scores.items() if runs or n == best), key=len)
         shortest = leaders[0]
         if others := [p for p in leaders[1:] if not p.startswith(f"{shortest}/")]:
             raise BagError(
@@ -225,12 +299,22 @@ class BagReader:
             )
         return shortest
 
+    def _holds_run(self, namespace: str) -> bool:
+        """Say whether a namespace holds what to start from: views, or an image or sectors with a track."""
+
+        def held(relative: str) -> bool:
+            info = self.topics.get(absolute_name(relative, namespace))
+            return info is not None and info.count > 0
+
+        whole = {s for s, kind in STREAMS.items() if held(kind.image_topic) and held(kind.info_topic)}
+        return bool(whole & set(VIEW_STREAMS)) or (bool(whole & {"image", "sector"}) and held("track"))
+
     def topic(self, relative: str) -> TopicInfo | None:
         """Return a topic of the contract by its relative name, None if the bag lacks it."""
         return self.topics.get(absolute_name(relative, self.namespace))
 
     def messages(self, topics: Iterable[str] | None = None) -> Iterator[BagMessage]:
-        """Iterate messages, in the order of recording within each storage file.
+        """Iterate messages in the order of their recording, over all files of the bag.
 
         Parameters
         ----------
@@ -243,35 +327,35 @@ class BagReader:
             If the storage cannot be read at all. Damaged parts are left out and named in `problems`.
         """
         wanted = None if topics is None else {absolute_name(t, self.namespace) for t in topics}
+
+        def chosen(channel: TopicType) -> bool:
+            return channel.message_encoding == "cdr" and (wanted is None or channel.topic in wanted)
+
         numbers: dict[str, int] = {}
-        for topic, type_name, when, cdr in self._raw(wanted):
-            number = numbers.get(topic, 0)
-            numbers[topic] = number + 1
-            yield BagMessage(topic, type_name, when, number, cdr)
-
-    def _raw(self, wanted: set[str] | None) -> Iterator[tuple[str, str, int, memoryview]]:
-        if self._foreign is not None:
+        for file, message in merged(self._files, chosen):
+            channel = self._files[file].channels[message.channel_id]
+            number = numbers.get(channel.topic, 0)
+            numbers[channel.topic] = number + 1
             try:
-                with RosbagsReader(self._foreign) as reader:
-                    chosen = [c for c in reader.connections if wanted is None or c.topic in wanted]
-                    for c, when, data in reader.messages(chosen) if chosen else ():
-                        yield c.topic, c.msgtype, when, memoryview(data)
-            except (ReaderError, OSError, ValueError) as error:
-                self._complain(f"{self._foreign.name}: {error}; what follows is lost")
-            return
+                data = unfold_message(message.data)
+            except ValueError as error:
+                self._complain(f"{channel.topic} message {number}: {error}; it is lost")
+                continue
+            yield BagMessage(channel.topic, channel.type_name, message.log_time_ns, number, data)
+        for topic, info in self.topics.items():
+            read = numbers.get(topic, 0)
+            if (wanted is None or topic in wanted) and read < info.count and not self._problems:
+                self._complain(f"{topic}: {read} of {info.count} messages could be read; the others are lost")
 
-        def chosen_channel(channel: TopicType) -> bool:
-            return wanted is None or channel.topic in wanted
 
-        for file in self._files:
-            for message in file.messages(chosen_channel):
-                channel = file.channels[message.channel_id]
-                if channel.message_encoding != "cdr":
-                    self._complain(
-                        f"{channel.topic} is encoded as {channel.message_encoding!r}; expected cdr: left out"
-                    )
-                    continue
-                yield channel.topic, channel.type_name, message.log_time_ns, message.data
+def _bare(name: str) -> str:
+    """Return a storage file's name without what compression of the whole file adds."""
+    return name.removesuffix(Path(name).suffix) if Path(name).suffix in _PACKED else name
+
+
+def _unplaced(error: BagError, folder: Path) -> str:
+    """Return what is wrong with a file of a bag, named without its folder."""
+    return str(error).replace(f"{folder}/", "")
 
 
 def qos_profile(depth: int, *, latched: bool = True) -> dict[str, Any]:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from mcap.records import ChunkIndex
-
 from msg_adapters.messages import stamp_to_ns
 from msg_adapters.topics import absolute_name, stream
 
 from ..core.errors import BagError
 from .bag import BagMessage, BagReader
-from .mcap_file import McapFile
+from .mcap_file import McapFile, Place
+from .storage import unfold_message
 
 
 class BagIndex:
@@ -46,24 +45,24 @@ class BagIndex:
         found: dict[int, Callable[[], Any]] = {}
         for file in self.files:
             channels = {i for i, c in file.channels.items() if c.topic == topic}
-            for chunk in file.chunks:
-                if not channels & set(chunk.message_index_offsets):
+            for place in file.places:
+                if not channels & place.channels:
                     continue
-                alone = chunk.message_start_time == chunk.message_end_time
-                if alone and chunk.message_start_time in stamps:
-                    held = [chunk.message_start_time]
+                alone = place.start_ns == place.end_ns
+                if alone and place.start_ns in stamps:
+                    held = [place.start_ns]
                 else:
-                    held = [stamp for stamp, _ in self._in_chunk(file, chunk, channels, topic)]
+                    held = [stamp for stamp, _ in self._at(file, place, channels, topic)]
                 for stamp in held:
                     if stamp in stamps:
-                        found.setdefault(stamp, self._loader(file, chunk, channels, topic, stamp))
+                        found.setdefault(stamp, self._loader(file, place, channels, topic, stamp))
         return found
 
     def _loader(
-        self, file: McapFile, chunk: ChunkIndex, channels: set[int], topic: str, stamp: int
+        self, file: McapFile, place: Place, channels: set[int], topic: str, stamp: int
     ) -> Callable[[], Any]:
         def load() -> Any:
-            for at, message in self._in_chunk(file, chunk, channels, topic):
+            for at, message in self._at(file, place, channels, topic):
                 if at == stamp:
                     return message
             raise BagError(f"{topic}: the image stamped {stamp} ns is not where the bag's index says")
@@ -71,10 +70,14 @@ class BagIndex:
         return load
 
     @staticmethod
-    def _in_chunk(file: McapFile, chunk: ChunkIndex, channels: set[int], topic: str) -> list[tuple[int, Any]]:
+    def _at(file: McapFile, place: Place, channels: set[int], topic: str) -> list[tuple[int, Any]]:
         kinds = {i: file.channels[i].type_name for i in channels}
         found = []
-        for raw in file.messages_of(chunk, channels):
-            message = BagMessage(topic, kinds[raw.channel_id], raw.log_time_ns, 0, raw.data).decode()
+        for raw in file.messages_of(place, channels):
+            try:
+                data = unfold_message(raw.data)
+            except ValueError as error:
+                raise BagError(f"{topic}: {error}") from error
+            message = BagMessage(topic, kinds[raw.channel_id], raw.log_time_ns, 0, data).decode()
             found.append((stamp_to_ns(message.header.stamp), message))
         return found

@@ -1,69 +1,64 @@
 """One MCAP file, read with whatever is left of it.
 
 The libraries' readers give up on a file at its first damage. This one reads through the index when
-there is a sound one, otherwise walks the records from the start, checks every checksum that the
-writer left, and goes on after a damaged chunk. Format: https://mcap.dev/spec.
+there is a sound one, otherwise walks the records from the start and makes its own, checks every checksum that
+the writer left, and goes on after a damaged chunk. Format: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
 
-import heapq
 import io
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
-import lz4.frame
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.records import Channel, ChunkIndex, Schema, Statistics
 
 from csas_shadow_ros.core.errors import BagError
 
+from .storage import RawMessage, Segment, TopicType, most_unfolded, open_regular, unfold
+
 MAGIC = b"\x89MCAP0\r\n"
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x02, 0x03, 0x04, 0x05, 0x06
 _CHUNK_INDEX, _STATISTICS, _DATA_END = 0x08, 0x0B, 0x0F
+#: Types that the format knows; those from 0x80 on are anybody's own.
+_KNOWN = range(0x01, 0x10)
+_FREE_TYPES = 0x80
 _FOOTER_BYTES = 9 + 20 + len(MAGIC)
 _RECORD_HEAD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
-_MAX_CHUNK_BYTES = 1 << 33
-
-
-class RawMessage(NamedTuple):
-    """A message as it lies in the file."""
-
-    channel_id: int
-    log_time_ns: int
-    data: memoryview
+#: A message has a time of its own, which no compression brings below a byte; and room for a few small ones.
+_FREE_MESSAGES = 1000
+#: All chunks of a file together may unfold to this (bytes), whatever their expansion: seconds of work.
+_FREE_TOTAL = 1 << 31
+#: As long (bytes) as a record is read that is not looked at.
+_PIECE = 1 << 20
 
 
 @dataclass(frozen=True)
-class TopicType:
-    """Topic and type of a channel.
+class Place:
+    """Where messages lie in a file: a chunk, or a message outside of chunks.
 
     Parameters
     ----------
-    topic, type_name : str
-        Names; the type as ``package/msg/Name``.
-    schema, schema_encoding : str
-        The type's definition.
-    message_encoding : str
-        ``cdr`` for ROS 2.
-    qos : str
-        ``offered_qos_profiles``, as it was recorded.
+    start_ns, end_ns : int
+        When the first and the last of its messages were recorded.
+    offset : int
+        Byte of the file where its record begins.
+    channels : frozenset of int
+        Channels of its messages.
     """
 
-    topic: str
-    type_name: str
-    schema: str
-    schema_encoding: str
-    message_encoding: str
-    qos: str
+    start_ns: int
+    end_ns: int
+    offset: int
+    channels: frozenset[int]
 
 
 class McapFile:
@@ -75,6 +70,8 @@ class McapFile:
         The file.
     complain : callable
         Called with one line for each damage, as it is met.
+    name : str, optional
+        What it is called in messages; the file's name by default.
 
     Raises
     ------
@@ -82,79 +79,102 @@ class McapFile:
         If it cannot be opened, is empty, or is no MCAP file.
     """
 
-    def __init__(self, path: Path, complain: Callable[[str], None]) -> None:
+    def __init__(self, path: Path, complain: Callable[[str], None], name: str | None = None) -> None:
         self.path = path
+        self.name = name or path.name
         self._complain = complain
         self.channels: dict[int, TopicType] = {}
-        self.counts: dict[int, int] | None = None
+        self.counts: dict[int, int] = {}
         self.compressions: set[str] = set()
         #: False if the file ends early or its index is damaged.
         self.complete = True
         #: False if some of the messages read so far are not covered by a checksum.
         self.has_checksums = True
         self._schemas: dict[int, Schema] = {}
-        #: Where the chunks lie; empty without an index.
-        self.chunks: list[ChunkIndex] = []
-        #: Whether every message can be found without reading the others.
-        self.indexed = False
+        #: Where the messages lie.
+        self.places: list[Place] = []
         try:
-            with path.open("rb") as file:
+            with open_regular(path) as file:
                 magic = file.read(len(MAGIC))
                 if not magic:
                     raise BagError(f"{path} is empty (0 bytes); expected an MCAP file")
                 if magic != MAGIC:
                     raise BagError(f"{path} is no MCAP file (starts with {magic!r}); expected {MAGIC!r}")
                 self.size = file.seek(0, io.SEEK_END)
-                self._read_summary(file)
-                if not self.indexed:
+                if not self._read_summary(file):
                     self._scan(file)
         except OSError as error:
             raise BagError(f"cannot read {path}: {error.strerror}") from error
 
-    def _read_summary(self, file: BinaryIO) -> None:
+    def _read_summary(self, file: BinaryIO) -> bool:
+        """Learn channels, counts and places from the file's index; say whether it tells all of them."""
         if self.size < len(MAGIC) + _FOOTER_BYTES:
             self._cut_short("before its first message")
-            return
+            return False
         file.seek(-_FOOTER_BYTES, io.SEEK_END)
         tail = file.read(_FOOTER_BYTES)
         op, length, start, _, crc = struct.unpack("<BQQQI", tail[:29])
         if tail[29:] != MAGIC or op != _FOOTER or length != 20:
             self._cut_short("its footer is missing: the recording was cut off")
-            return
+            return False
         if start == 0:
-            return  # written without a summary: not an error, the records are walked
+            return False  # written without a summary: not an error, the records are walked
         end = self.size - _FOOTER_BYTES
         if not len(MAGIC) <= start <= end:
             self._cut_short(f"its summary is said to start at byte {start} of {self.size}")
-            return
+            return False
         file.seek(start)
         summary = file.read(end - start)
         if crc and zlib.crc32(summary + tail[:25]) != crc:
             self._cut_short("the checksum of its summary is wrong")
-            return
+            return False
         statistics: Statistics | None = None
+        chunks: list[ChunkIndex] = []
         try:
             for op, body in _records(memoryview(summary)):
                 if op == _STATISTICS:
                     statistics = Statistics.read(_stream(body))
                 elif op == _CHUNK_INDEX:
-                    self.chunks.append(ChunkIndex.read(_stream(body)))
+                    chunks.append(ChunkIndex.read(_stream(body)))
                 else:
                     self._definition(op, body)
         except (McapError, struct.error, ValueError, _ShortError) as error:
             self._cut_short(f"its summary cannot be parsed ({error})")
-            self.chunks.clear()
-            return
-        if statistics is not None:
-            self.counts = {c: n for c, n in statistics.channel_message_counts.items() if n}
-            named = set(self.counts) <= set(self.channels)
-            # Messages outside chunks are not in the index: then only walking finds them all.
-            self.indexed = named and (bool(self.chunks) or statistics.message_count == 0)
-            self.compressions = {c.compression for c in self.chunks}
+            return False
+        self.has_checksums &= bool(crc)
+        if statistics is None:
+            return False
+        counts = {c: n for c, n in statistics.channel_message_counts.items() if n}
+        # The format lets a writer leave out counts by channel, what a chunk holds, and messages outside of
+        # chunks from the index: then only walking finds them all.
+        told = sum(counts.values()) == statistics.message_count and set(counts) <= set(self.channels)
+        held = frozenset().union(*(c.message_index_offsets for c in chunks))
+        empty = [
+            c for c in chunks if not c.message_index_offsets and (c.message_start_time or c.message_end_time)
+        ]
+        if not told or empty or not set(counts) <= held:
+            return False
+        if statistics.message_count > self._most_messages(self.size):
+            return False
+        if sum(c.uncompressed_size for c in chunks) > max(_FREE_TOTAL, most_unfolded(self.size)):
+            return False
+        self.counts = counts
+        self.compressions = {c.compression for c in chunks}
+        self.places = [
+            Place(
+                c.message_start_time,
+                c.message_end_time,
+                c.chunk_start_offset,
+                frozenset(c.message_index_offsets),
+            )
+            for c in chunks
+            if c.message_index_offsets
+        ]
+        return True
 
     def _cut_short(self, why: str) -> None:
         self.complete = False
-        self._complain(f"{self.path.name}: {why}; reading what is left of it")
+        self._complain(f"{self.name}: {why}; reading what is left of it")
 
     def _definition(self, op: int, body: memoryview) -> None:
         if op == _SCHEMA:
@@ -164,130 +184,142 @@ class McapFile:
             channel = Channel.read(_stream(body))
             found = self._schemas.get(channel.schema_id)
             self.channels[channel.id] = TopicType(
-                channel.topic,
-                found.name if found else "",
-                found.data.decode(errors="replace") if found else "",
-                found.encoding if found else "",
-                channel.message_encoding,
-                channel.metadata.get("offered_qos_profiles", ""),
+                channel.topic, found.name if found else "", channel.message_encoding
             )
 
+    @staticmethod
+    def _most_messages(stored: int) -> int:
+        return _FREE_MESSAGES + stored
+
     def _scan(self, file: BinaryIO) -> None:
-        """Learn channels and counts of a file without an index by walking it once."""
-        counts: dict[int, int] = {}
-        for message in self._walk(file, None, self._complain):
-            counts[message.channel_id] = counts.get(message.channel_id, 0) + 1
-        self.counts = counts
+        """Learn channels, counts and places of a file without an index by walking it once."""
+        self.counts, self.places = {}, []
+        for offset, op, body in self._walk(file):
+            try:
+                records = list(self._messages_in(op, body, learn=True))
+            except (_ShortError, McapError, struct.error, ValueError) as error:
+                self._damaged(offset, error)
+                continue
+            held: dict[int, int] = {}
+            for channel, _, _ in records:
+                held[channel] = held.get(channel, 0) + 1
+            for channel in held.keys() - self.channels.keys():
+                self._complain(
+                    f"{self.name}: a message near byte {offset} belongs to channel {channel},"
+                    " which is not defined"
+                )
+                del held[channel]
+            for channel, count in held.items():
+                self.counts[channel] = self.counts.get(channel, 0) + count
+            if held:
+                times = [when for channel, when, _ in records if channel in held]
+                self.places.append(Place(min(times), max(times), offset, frozenset(held)))
         if not self.complete:
-            self._complain(f"{self.path.name}: {sum(counts.values())} messages recovered")
+            self._complain(f"{self.name}: {sum(self.counts.values())} messages recovered")
 
-    def messages(self, wanted: Callable[[TopicType], bool]) -> Iterator[RawMessage]:
-        """Iterate messages of the wanted channels: in time order with an index, else as written.
-
-        Data are views of the chunk that holds them; nothing else of the file is kept.
-        """
-        with self.path.open("rb") as file:
-            if self.indexed:
-                yield from self._through_index(file, {i for i, c in self.channels.items() if wanted(c)})
-            else:
-                # Damage was reported by the scan that went before.
-                yield from self._walk(file, wanted, lambda _: None)
-
-    def _through_index(self, file: BinaryIO, channels: set[int]) -> Iterator[RawMessage]:
-        chunks = [
-            c
-            for c in self.chunks
-            # Without message indexes nobody knows what is in the chunk.
-            if not c.message_index_offsets or channels & set(c.message_index_offsets)
-        ]
-        chunks.sort(key=lambda c: (c.message_start_time, c.chunk_start_offset))
-        pending: list[tuple[int, int, RawMessage]] = []
-        serial = 0
-        for chunk in chunks:
-            while pending and pending[0][0] < chunk.message_start_time:
-                yield heapq.heappop(pending)[2]
-            for message in self._messages_of(file, chunk, channels):
-                heapq.heappush(pending, (message.log_time_ns, serial, message))
-                serial += 1
-        while pending:
-            yield heapq.heappop(pending)[2]
-
-    def messages_of(self, chunk: ChunkIndex, channels: set[int]) -> list[RawMessage]:
-        """Read one chunk of the index, and none of the others.
-
-        Returns
-        -------
-        list of RawMessage
-            Its messages of these channels; none if the chunk is damaged, which is complained of.
-        """
-        with self.path.open("rb") as file:
-            return self._messages_of(file, chunk, channels)
-
-    def _messages_of(self, file: BinaryIO, chunk: ChunkIndex, channels: set[int]) -> list[RawMessage]:
-        file.seek(chunk.chunk_start_offset)
-        try:
-            op, body = self._read_record(file)
-            if op != _CHUNK:
-                raise _ShortError(f"no chunk where the index says (record type {op})")
-            messages = [_message(record) for op, record in self._unpack(body) if op == _MESSAGE]
-        except (_ShortError, struct.error, ValueError) as error:
-            self._damaged(chunk.chunk_start_offset, error, self._complain)
-            return []
-        return [m for m in messages if m.channel_id in channels]
-
-    def _walk(
-        self,
-        file: BinaryIO,
-        wanted: Callable[[TopicType], bool] | None,
-        complain: Callable[[str], None],
-    ) -> Iterator[RawMessage]:
+    def _walk(self, file: BinaryIO) -> Iterator[tuple[int, int, memoryview]]:
+        """Iterate chunks and messages outside of chunks, from the start as far as the records go."""
         file.seek(len(MAGIC))
-        loose = False
-        checking = wanted is None
         running = zlib.crc32(MAGIC)
+        loose = False
+        total = 0
         while True:
             offset = file.tell()
             try:
-                op, body = self._read_record(file)
+                op, length = self._record_head(file)
             except _ShortError as error:
                 self.complete = False
-                complain(f"{self.path.name}: ends in the middle of a record at byte {offset} ({error})")
+                self._complain(f"{self.name}: ends in the middle of a record at byte {offset} ({error})")
                 return
             if op == _DATA_END:
-                (crc,) = struct.unpack_from("<I", body)
-                if checking and crc and crc != running:
-                    complain(f"{self.path.name}: the checksum of its data is wrong: some bits have changed")
-                if loose and not crc:
-                    self.has_checksums = False
+                (crc,) = struct.unpack("<I", file.read(4).ljust(4, b"\0"))
+                if crc and crc != running:
+                    self._complain(f"{self.name}: the checksum of its data is wrong: some bits have changed")
+                self.has_checksums &= bool(crc) or not loose
                 return
             if op == _FOOTER:
                 return
-            if checking:
-                running = zlib.crc32(body, zlib.crc32(_RECORD_HEAD.pack(op, len(body)), running))
-            try:
-                if op == _CHUNK:
-                    records: Iterable[tuple[int, memoryview]] = list(self._unpack(body))
-                elif op == _MESSAGE:
-                    loose, records = True, [(op, body)]
-                else:
-                    records = [(op, body)]
-                for inner, content in records:
-                    if inner == _MESSAGE:
-                        message = _message(content)
-                        channel = self.channels.get(message.channel_id)
-                        if channel is None:
-                            complain(
-                                f"{self.path.name}: a message near byte {offset} belongs to channel"
-                                f" {message.channel_id}, which is not defined"
-                            )
-                        elif wanted is None or wanted(channel):
-                            yield message
-                    else:
-                        self._definition(inner, content)
-            except (_ShortError, McapError, struct.error, ValueError) as error:
-                self._damaged(offset, error, complain)
+            if op not in _KNOWN and op < _FREE_TYPES:
+                self.complete = False
+                self._complain(
+                    f"{self.name}: damaged at byte {offset}: no record has type {op}; what follows is lost"
+                )
+                return
+            running = zlib.crc32(_RECORD_HEAD.pack(op, length), running)
+            if op not in (_CHUNK, _MESSAGE, _SCHEMA, _CHANNEL):
+                # An attachment may be of any size, and is not looked at.
+                while length:
+                    piece = file.read(min(length, _PIECE))
+                    running, length = zlib.crc32(piece, running), length - len(piece)
+                continue
+            body = memoryview(file.read(length))
+            running = zlib.crc32(body, running)
+            if op in (_SCHEMA, _CHANNEL):
+                try:
+                    self._definition(op, body)
+                except (McapError, struct.error, ValueError) as error:
+                    self._damaged(offset, error)
+                continue
+            loose |= op == _MESSAGE
+            if op == _CHUNK and length >= _CHUNK_HEAD.size:
+                claimed = _CHUNK_HEAD.unpack_from(body)[2]
+                # One that claims too much is refused alone.
+                total += claimed if claimed <= most_unfolded(length) else 0
+            if total > max(_FREE_TOTAL, most_unfolded(self.size)):
+                self.complete = False
+                self._complain(
+                    f"{self.name}: its {self.size} bytes unfold to {total} and more; the rest is lost"
+                )
+                return
+            yield offset, op, body
 
-    def _read_record(self, file: BinaryIO) -> tuple[int, memoryview]:
+    def segments(self, wanted: Callable[[TopicType], bool]) -> list[Segment]:
+        """Return where the messages of the wanted channels lie; data are views of what holds them."""
+        chosen = {i for i, c in self.channels.items() if wanted(c)}
+
+        def reading(place: Place) -> Callable[[], Iterator[RawMessage]]:
+            return lambda: iter(self.messages_of(place, chosen))
+
+        return [(p.start_ns, reading(p)) for p in self.places if p.channels & chosen]
+
+    def messages_of(self, place: Place, channels: set[int]) -> Iterator[RawMessage]:
+        """Iterate the messages of one place in time order, and read none of the others.
+
+        None if it is damaged, which is complained of.
+        """
+        try:
+            with open_regular(self.path) as file:
+                file.seek(place.offset)
+                op, length = self._record_head(file)
+                if op not in (_CHUNK, _MESSAGE):
+                    raise _ShortError(f"no chunk where the index says (record type {op})")
+                body = memoryview(file.read(length))
+            records = [r for r in self._messages_in(op, body) if r[0] in channels]
+        except (_ShortError, McapError, OSError, struct.error, ValueError) as error:
+            self._damaged(place.offset, error)
+            return
+        records.sort(key=lambda record: record[1])
+        for channel, when, data in records:
+            yield RawMessage(channel, when, data)
+
+    def _messages_in(
+        self, op: int, body: memoryview, *, learn: bool = False
+    ) -> Iterator[tuple[int, int, memoryview]]:
+        """Iterate (channel, time, data) of a chunk's or a message's record; learn the definitions in it."""
+        left = self._most_messages(len(body))
+        for inner, content in self._unpack(body) if op == _CHUNK else [(op, body)]:
+            if inner == _MESSAGE:
+                left -= 1
+                if left < 0:
+                    raise ValueError(f"chunk of {len(body)} bytes holds more messages than that")
+                channel, _, when, _ = _MESSAGE_HEAD.unpack_from(content)
+                yield channel, when, content[_MESSAGE_HEAD.size :]
+            elif inner not in (_SCHEMA, _CHANNEL) and inner < _FREE_TYPES:
+                raise ValueError(f"chunk holds a record of type {inner}")
+            elif learn:
+                self._definition(inner, content)
+
+    def _record_head(self, file: BinaryIO) -> tuple[int, int]:
         here = file.tell()
         head = file.read(_RECORD_HEAD.size)
         if len(head) < _RECORD_HEAD.size:
@@ -296,10 +328,10 @@ class McapFile:
         left = self.size - here - _RECORD_HEAD.size
         if length > left:
             raise _ShortError(f"{left} of {length} bytes")
-        return op, memoryview(file.read(length))
+        return op, length
 
-    def _damaged(self, offset: int, error: Exception, complain: Callable[[str], None]) -> None:
-        complain(f"{self.path.name}: damaged at byte {offset}: {error}; its messages are lost")
+    def _damaged(self, offset: int, error: Exception) -> None:
+        self._complain(f"{self.name}: damaged at byte {offset}: {error}; its messages are lost")
 
     def _unpack(self, body: memoryview) -> Iterator[tuple[int, memoryview]]:
         """Decompress a chunk's body, check its checksum, and iterate its records."""
@@ -311,18 +343,10 @@ class McapFile:
         at += name_length
         (length,) = struct.unpack_from("<Q", body, at)
         data = body[at + 8 : at + 8 + length]
-        if len(data) != length or size > _MAX_CHUNK_BYTES:
+        if len(data) != length:
             raise _ShortError(f"chunk of {length} bytes has {len(data)}")
         self.compressions.add(compression)
-        try:
-            if compression == "zstd":
-                data = memoryview(zstandard.ZstdDecompressor().decompress(data, max_output_size=size))
-            elif compression == "lz4":
-                data = memoryview(lz4.frame.decompress(data))
-            elif compression:
-                raise ValueError(f"chunk compression {compression!r} is unknown; expected zstd, lz4 or none")
-        except (zstandard.ZstdError, RuntimeError) as error:
-            raise ValueError(f"chunk cannot be decompressed ({error})") from error
+        data = unfold(data, compression, size)
         if len(data) != size:
             raise ValueError(f"chunk has {len(data)} bytes; expected {size}")
         if not crc:
@@ -351,8 +375,3 @@ def _records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
             raise _ShortError(f"record of {length} bytes has {len(data) - at}")
         yield op, data[at : at + length]
         at += length
-
-
-def _message(body: memoryview) -> RawMessage:
-    channel, _, log_time, _ = _MESSAGE_HEAD.unpack_from(body)
-    return RawMessage(channel, log_time, body[_MESSAGE_HEAD.size :])

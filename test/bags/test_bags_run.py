@@ -503,7 +503,7 @@ def test_what_is_no_bag_is_refused_by_name(tmp_path):
     with pytest.raises(BagError, match=r"cannot read .*old\.db3"):
         read_run(tmp_path / "old.db3")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(BagError, match=r"holds no metadata\.yaml and no \.mcap file"):
+    with pytest.raises(BagError, match=r"holds no metadata\.yaml and no \.mcap or \.db3 file"):
         read_run(tmp_path / "folder")
     (tmp_path / "folder" / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
     with pytest.raises(BagError, match=r"metadata\.yaml cannot be read"):
