@@ -125,6 +125,8 @@ class BagReader:
         self.path = Path(path)
         self._problems: dict[str, None] = {}
         self._files: list[StorageFile] = []
+        #: Topics whose messages are no CDR, and what they are: nothing is said unless they are read.
+        self._others: dict[str, str] = {}
         #: False if the recording was cut off or a file of it is missing.
         self.complete = True
         if not self.path.exists():
@@ -235,6 +237,10 @@ class BagReader:
             raise BagError(f"{self.path}: no storage file is there; expected {', '.join(names[:8]) or 'one'}")
         for name in lost:
             self._cut(f"{name}, listed in {METADATA}, is missing")
+        known = {_bare(p.name) for p in present or stored}
+        for stranger in [p.name for p in stored if _bare(p.name) not in known]:
+            # It may be a part of this recording or of another one: only a person can tell.
+            self._cut(f"{stranger} is not listed in {METADATA}; it is not read")
         return present or stored
 
     def _open_file(self, path: Path) -> StorageFile:
@@ -265,9 +271,7 @@ class BagReader:
             topic, type_name, count = channel.topic, channel.type_name, file.counts.get(i, 0)
             if channel.message_encoding != "cdr":
                 if count:
-                    self._complain(
-                        f"{topic} is encoded as {channel.message_encoding!r}; expected cdr: left out"
-                    )
+                    self._others.setdefault(topic, channel.message_encoding)
                 continue
             if (known := self.topics.get(topic)) is not None:
                 count += known.count
@@ -331,6 +335,8 @@ class BagReader:
         def chosen(channel: TopicType) -> bool:
             return channel.message_encoding == "cdr" and (wanted is None or channel.topic in wanted)
 
+        for topic in self._others if wanted is None else self._others.keys() & wanted:
+            self._complain(f"{topic} is encoded as {self._others[topic]!r}; expected cdr: left out")
         numbers: dict[str, int] = {}
         for file, message in merged(self._files, chosen):
             channel = self._files[file].channels[message.channel_id]

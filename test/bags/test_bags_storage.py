@@ -309,6 +309,15 @@ def test_a_bag_all_of_whose_files_are_spoilt_is_refused_by_the_name_of_one(tmp_p
         BagReader(path)
 
 
+def test_a_storage_file_that_is_not_listed_is_not_mixed_in_and_is_told(tmp_path):
+    path = split(tmp_path / "bag", [[m] for m in messages()])
+    names = [f"bag_{n}.mcap" for n in range(VIEWS) if n != 5]
+    edit(path, relative_file_paths=names, message_count=len(names))
+    reader = BagReader(path)
+    assert content(path) == [m for n, m in enumerate(messages()) if n != 5]
+    assert reader.problems == ["bag_5.mcap is not listed in metadata.yaml; it is not read"]
+
+
 def test_messages_that_metadata_tells_of_and_the_files_lack_are_told(tmp_path):
     path = write(tmp_path / "bag", messages())
     edit(path, message_count=36)
@@ -376,6 +385,8 @@ def test_a_channel_of_another_encoding_on_a_topic_of_the_contract_is_left_out_an
     reader = BagReader(path)
     assert content(path) == list(messages())
     assert reader.topics["/csas/progress"].type_name == "diagnostic_msgs/msg/DiagnosticArray"
+    assert reader.problems == []
+    assert len(list(reader.messages(["progress"]))) == VIEWS
     assert reader.problems == ["/csas/progress is encoded as 'json'; expected cdr: left out"]
 
 
