@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -30,7 +31,8 @@ def surface_field(grid: VoxelGrid) -> NDArray[np.float32]:
     """
     with np.errstate(invalid="ignore"):
         depth = np.where(np.isfinite(grid.likelihood), grid.threshold - grid.likelihood, np.float32(-np.inf))
-    limit = np.float32(max(grid.threshold, 1e-3))
+    depth = np.nan_to_num(depth, nan=0.0, posinf=np.inf, neginf=-np.inf)  # a threshold that is not known
+    limit = np.float32(max(1e-3, grid.threshold) if math.isfinite(grid.threshold) else 1.0)
     floor = np.float32(1e-3) * limit
     inside = np.clip(depth, floor, limit)
     outside = np.clip(depth, -limit, -floor)
@@ -45,7 +47,7 @@ def surface_field(grid: VoxelGrid) -> NDArray[np.float32]:
 
 
 def mesh_from_grid(grid: VoxelGrid) -> trimesh.Trimesh:
-    """Extract the object's closed surface by marching cubes.
+    """Extract the object's closed surface: by marching cubes, or where these leave it open by tetrahedra.
 
     Parameters
     ----------
@@ -55,12 +57,24 @@ def mesh_from_grid(grid: VoxelGrid) -> trimesh.Trimesh:
     Returns
     -------
     trimesh.Trimesh
-        Watertight, outward normals, metres in the scene frame.
+        Watertight, outward normals, metres in the scene frame: every edge is of exactly two faces.
 
     Raises
     ------
     NoTargetError
         If the grid holds no object.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from csas_shadow_ros.core.volume import Volume, VoxelGrid
+    >>> occupied = np.zeros((3, 3, 3), bool)
+    >>> occupied[0, 1, 1] = True
+    >>> likelihood = np.where(occupied, np.float32(0), np.float32(1))
+    >>> volume = Volume.around((0, 0), (0.3, 0.3, 0.3), 0.1)
+    >>> grid = VoxelGrid(volume, likelihood, np.ones((3, 3, 3), np.uint16), 0.5, occupied)
+    >>> mesh_from_grid(grid).is_watertight
+    True
     """
     # Late: half a second that every process of the node graph, and the viewer, would wait for.
     import trimesh
@@ -69,14 +83,118 @@ def mesh_from_grid(grid: VoxelGrid) -> trimesh.Trimesh:
     if not grid.occupied.any():
         raise NoTargetError("the grid holds no object; expected at least one occupied voxel to mesh")
     d = grid.volume.voxel_size_m
+    field = surface_field(grid)
+    origin = np.asarray(grid.volume.origin_m)
     vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
-        surface_field(grid), 0.0, spacing=(d, d, d)
+        field, 0.0, spacing=(d, d, d)
     )
-    xyz = vertices[:, ::-1] - d + np.asarray(grid.volume.origin_m)  # (z, y, x) → (x, y, z); -d: the padding
+    xyz = vertices[:, ::-1] - d + origin  # (z, y, x) → (x, y, z); -d: the padding
     mesh = trimesh.Trimesh(xyz, faces[:, ::-1], process=True)
     if mesh.volume < 0:
         mesh.invert()
-    return mesh
+    if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0:
+        return mesh
+    # Where voxels meet at an edge or a corner alone, the table of cubes has cases that do not fit their
+    # neighbours. Tetrahedra have none.
+    nodes, faces = _march_tetrahedra(field)
+    return trimesh.Trimesh(nodes * d - d + origin, faces, process=False)
+
+
+def _parity(order: Sequence[int]) -> bool:
+    """Say whether a permutation is odd."""
+    return bool(sum(a > b for a, b in itertools.combinations(order, 2)) % 2)
+
+
+def _kuhn() -> NDArray[np.int64]:
+    """Return the six tetrahedra of a cube, alike oriented; a corner's number has the bits x, y, z."""
+    tetrahedra = []
+    for axes in itertools.permutations(range(3)):
+        first, second = 1 << axes[0], (1 << axes[0]) | (1 << axes[1])
+        tetrahedra.append([0, second, first, 7] if _parity(axes) else [0, first, second, 7])
+    return np.array(tetrahedra)
+
+
+def _cuts() -> list[list[tuple[tuple[int, int], ...]]]:
+    """Return the triangles for each set of corners inside (as bits): three (inside, outside) edges each."""
+    table: list[list[tuple[tuple[int, int], ...]]] = []
+    for code in range(16):
+        inside = [i for i in range(4) if code >> i & 1]
+        outside = [i for i in range(4) if not code >> i & 1]
+        if len(inside) in (0, 4):
+            table.append([])
+        elif len(inside) == 2:
+            (a, b), (c, d) = inside, outside
+            if _parity((a, b, c, d)):
+                c, d = d, c
+            table.append([((a, c), (a, d), (b, d)), ((a, c), (b, d), (b, c))])
+        else:
+            alone, (b, c, d) = (inside, outside) if len(inside) == 1 else (outside, inside)
+            a = alone[0]
+            # Seen from outside, the cut's corners go round against the clock.
+            if _parity((a, b, c, d)) is (len(inside) == 1):
+                c, d = d, c
+            edges = [(a, k) if len(inside) == 1 else (k, a) for k in (b, c, d)]
+            table.append([tuple(edges)])
+    return table
+
+
+_KUHN = _kuhn()
+_CUTS = _cuts()
+
+
+def _march_tetrahedra(
+    field: NDArray[np.float32],
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the surface field = 0, which is closed whatever the signs of the field.
+
+    Each cube is cut into six tetrahedra about the diagonal from its lowest to its highest corner, so that
+    neighbours cut their common face alike. A tetrahedron's face is crossed by no segment or by one, which the
+    signs at its three corners tell: so both tetrahedra at the face have the same, and each edge of the
+    surface is of two triangles. Vertices are told apart by the edge that they lie on, not by their place.
+
+    Parameters
+    ----------
+    field : ndarray of float32, shape (nz, ny, nx)
+        Nowhere 0; negative all round.
+
+    Returns
+    -------
+    vertices : ndarray of float64, shape (n, 3)
+        (x, y, z), in voxels.
+    faces : ndarray of int64, shape (m, 3)
+        Normals point to the negative side.
+    """
+    _, ny, nx = field.shape
+    offsets = [(i & 1) + nx * ((i >> 1 & 1) + ny * (i >> 2)) for i in range(8)]
+    inside = field > 0
+    count = np.zeros(tuple(n - 1 for n in field.shape), np.uint8)
+    for corner in range(8):
+        right, up, above = corner & 1, corner >> 1 & 1, corner >> 2
+        count += inside[above:, up:, right:][: count.shape[0], : count.shape[1], : count.shape[2]]
+    z, y, x = np.nonzero((count > 0) & (count < 8))
+    base = x + nx * (y + ny * z.astype(np.int64))
+    values, within = field.ravel(), inside.ravel()
+    triangles = []
+    for tetrahedron in _KUHN:
+        codes = sum(
+            within[base + offsets[corner]].astype(np.int64) << i for i, corner in enumerate(tetrahedron)
+        )
+        for code, cuts in enumerate(_CUTS):
+            cubes = base[codes == code] if cuts else base[:0]
+            for cut in cuts if len(cubes) else ():
+                edges = []
+                for one in cut:
+                    low, high = sorted(int(tetrahedron[i]) for i in one)
+                    # Along a cube's diagonals corners only gain bits: these say which edge it is.
+                    edges.append((cubes + offsets[low]) * 8 + (high ^ low))
+                triangles.append(np.stack(edges, axis=1))
+    keys, faces = np.unique(np.concatenate(triangles), return_inverse=True)
+    start, direction = keys // 8, keys % 8
+    end = start + np.array(offsets)[direction]
+    first, last = values[start].astype(np.float64), values[end].astype(np.float64)
+    step = np.stack([direction & 1, direction >> 1 & 1, direction >> 2], axis=1)
+    place = np.stack([start % nx, start // nx % ny, start // (nx * ny)], axis=1)
+    return place + (first / (first - last))[:, None] * step, faces.reshape(-1, 3)
 
 
 @dataclass(frozen=True)
