@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from dataclasses import dataclass
@@ -13,18 +14,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import CsasError
 from ..core.mesh import Dimensions, measure
+from ..core.solid import judge_solid
 from ..core.volume import Volume, VoxelGrid
-from ..simulation.hull import iou, shadow_hull, voxelise_truth
+from ..simulation.hull import enclosed_volume, iou, shadow_hull, voxelise_truth
 
 if TYPE_CHECKING:
     import trimesh
 
 #: Margin round the true target in which scores look for what was wrongly left standing, voxels.
 _MARGIN_VOXELS = 2
+#: Largest truth that is read: trimesh takes some 500 bytes a triangle, STL has 50.
+_MOST_BYTES = 64_000_000
+_MOST_RECORD_BYTES = 1_000_000
+#: Voxels of the lattice that scores are counted on, some ten bytes each, or twice those of the grid itself.
+_MOST_VOXELS = 1 << 25
+#: A truth so many times as long as the scene is in other units: a target that fills a quarter of the scene is
+#: 10 times as long as it in inches taken for metres, 25 in centimetres, 250 in millimetres.
+_OTHER_UNITS = 8.0
 
 
 class TruthError(CsasError):
-    """A truth file cannot be read."""
+    """A truth file cannot be read, or nothing can be compared with it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,20 +49,54 @@ class KnownTruth:
         The target, scene frame, metres; without faces for an empty seabed.
     record : dict
         What the simulation wrote about it.
+    notes : tuple of str
+        What was wrong with the mesh and has been put right.
+    open_edges : int
+        Edges that the mesh ends at; 0: it encloses a volume.
+    volume_m3 : float
+        Volume of the union of its bodies; NaN where the mesh encloses none.
+    unusable : str
+        Why nothing may be compared with it; empty if it may.
     """
 
     path: Path
     mesh: trimesh.Trimesh
     record: dict[str, Any]
+    notes: tuple[str, ...] = ()
+    open_edges: int = 0
+    volume_m3: float = 0.0
+    unusable: str = ""
+
+    @property
+    def has_object(self) -> bool:
+        """Whether there is a target at all."""
+        return bool(len(self.mesh.faces))
+
+    @property
+    def problem(self) -> str:
+        """Why it cannot be scored against; empty if it can."""
+        if self.unusable:
+            return self.unusable
+        if self.open_edges:
+            return (
+                f"truth {self.path} is not closed: it ends at {self.open_edges} edges;"
+                " expected a closed surface: without one it has no volume and no IoU"
+            )
+        return ""
 
     @property
     def dimensions(self) -> Dimensions | None:
-        """Measures of the target, taken as a reconstruction's are; None where there is none."""
-        return measure(self.mesh) if len(self.mesh.faces) else None
+        """Measures of the target, taken as a reconstruction's are; None where there is none.
+
+        The volume is NaN where the mesh is not closed.
+        """
+        if not self.has_object or self.unusable:
+            return None
+        return dataclasses.replace(measure(self.mesh), volume_m3=self.volume_m3)
 
 
 def read_truth(bag: str | Path) -> KnownTruth | None:
-    """Read ``<bag>.truth.stl`` and, where it is there too, ``<bag>.truth.json``.
+    """Read ``<bag>.truth.stl`` and, where it is there too, ``<bag>.truth.json``, and judge the mesh.
 
     Returns
     -------
@@ -71,16 +115,73 @@ def read_truth(bag: str | Path) -> KnownTruth | None:
     import trimesh  # late: few bags have a truth beside them
 
     try:
-        record = json.loads(record_path.read_text(encoding="utf-8")) if record_path.exists() else {}
-        raw = stl.read_bytes()
+        record: Any = {}
+        if record_path.exists():
+            record = json.loads(_bounded(record_path, _MOST_RECORD_BYTES).decode("utf-8"))
+            if not isinstance(record, dict):
+                raise ValueError(f"{record_path.name} holds a {type(record).__name__}; expected an object")
+        raw = _bounded(stl, _MOST_BYTES)
         # A binary STL without triangles, an empty seabed, is none to trimesh.
-        empty = len(raw) == 84 and int.from_bytes(raw[80:84], "little") == 0
-        mesh: Any = trimesh.Trimesh() if empty else trimesh.load(str(stl), force="mesh")
-        if not empty:
-            mesh.merge_vertices()
+        if len(raw) == 84 and int.from_bytes(raw[80:84], "little") == 0:
+            return KnownTruth(stl, trimesh.Trimesh(), record)
+        mesh: Any = trimesh.load(str(stl), force="mesh", process=False)
+        if not len(mesh.faces):
+            raise ValueError("it holds no triangles")
+        solid = judge_solid(mesh)
+        volume = math.nan if solid.open_edges else enclosed_volume(solid.mesh)
     except Exception as error:  # trimesh raises whatever its readers raise
         raise TruthError(f"truth {stl} cannot be read: {error}; repair it or take it away") from error
-    return KnownTruth(stl, mesh, record)
+    return KnownTruth(stl, solid.mesh, record, solid.notes, solid.open_edges, volume)
+
+
+def _bounded(path: Path, most: int) -> bytes:
+    """Read a file of at most so many bytes; a pipe, which may never end, is no file."""
+    if not path.is_file():
+        raise ValueError(f"{path.name} is no plain file")
+    if (size := path.stat().st_size) > most:
+        raise ValueError(f"{path.name} has {size} bytes; expected at most {most}")
+    return path.read_bytes()
+
+
+def placed(truth: KnownTruth, extent_m: tuple[float, float, float, float], voxel_size_m: float) -> KnownTruth:
+    """Say whether a truth can be of a scene: a mesh in other units or another frame is of none.
+
+    Parameters
+    ----------
+    truth : KnownTruth
+        As it was read.
+    extent_m : (float, float, float, float)
+        Left, right, bottom and top of what was imaged.
+    voxel_size_m : float
+        Edge of a voxel of the reconstruction.
+
+    Returns
+    -------
+    KnownTruth
+        With the reason in `unusable` where it cannot.
+    """
+    if not truth.has_object or truth.unusable:
+        return truth
+    left, right, bottom, top = extent_m
+    low, high = truth.mesh.bounds
+    size = high - low
+    scene = f"the scene x {left:.4g} to {right:.4g} m, y {bottom:.4g} to {top:.4g} m"
+    text = " x ".join(f"{side:.4g}" for side in size)
+    why = ""
+    if size.max() > _OTHER_UNITS * max(right - left, top - bottom):
+        why = f"is {text} m, {scene}; expected a mesh in metres"
+        for unit, metres in (("cm", 1e-2), ("mm", 1e-3)):
+            if size.max() * metres <= max(right - left, top - bottom):
+                why += f" (in {unit} it would be {' x '.join(f'{side * metres:.3g}' for side in size)} m)"
+                break
+    elif size.max() < voxel_size_m:
+        why = f"is {text} m, less than a voxel of {voxel_size_m:g} m; expected a mesh in metres"
+    elif low[0] > right or high[0] < left or low[1] > top or high[1] < bottom:
+        middle = (low + high) / 2.0
+        why = f"lies at ({middle[0]:.6g}, {middle[1]:.6g}) m, {scene}; expected the scene frame"
+    if not why:
+        return truth
+    return dataclasses.replace(truth, unusable=f"truth {truth.path} {why}")
 
 
 def score(
@@ -106,8 +207,17 @@ def score(
     -------
     dict
         ``iou_truth``, ``iou_hull``, ``iou_hull_truth``; with matter also ``iou_matter``.
+
+    Raises
+    ------
+    TruthError
+        If the truth is not one to compare with, or it would take more memory than a run does.
+    GeometryError
+        If it reaches as high as the sonar.
     """
-    volume, before = _widened(grid.volume, truth.mesh)
+    if truth.problem:
+        raise TruthError(truth.problem)
+    volume, before = _widened(truth, grid)
     nz, ny, nx = grid.volume.shape
     z, y, x = before
 
@@ -131,10 +241,10 @@ def score(
     return scores
 
 
-def _widened(volume: Volume, mesh: trimesh.Trimesh) -> tuple[Volume, tuple[int, int, int]]:
-    """Return the lattice grown to hold the mesh, and how many voxels were put before (z, y, x)."""
-    d = volume.voxel_size_m
-    low, high = mesh.bounds
+def _widened(truth: KnownTruth, grid: VoxelGrid) -> tuple[Volume, tuple[int, int, int]]:
+    """Return the lattice grown to hold the truth, and how many voxels were put before (z, y, x)."""
+    volume, d = grid.volume, grid.volume.voxel_size_m
+    low, high = truth.mesh.bounds
     before, after = [], []
     for axis, n in zip(range(3), volume.shape[::-1], strict=True):
         first = volume.origin_m[axis]
@@ -143,5 +253,11 @@ def _widened(volume: Volume, mesh: trimesh.Trimesh) -> tuple[Volume, tuple[int, 
         before.append(max(0, missing) if axis < 2 else 0)
         after.append(max(0, math.ceil((high[axis] + margin - (first + (n - 0.5) * d)) / d)))
     nx, ny, nz = (n + b + a for n, b, a in zip(volume.shape[::-1], before, after, strict=True))
+    most = max(_MOST_VOXELS, 2 * math.prod(volume.shape))
+    if nx * ny * nz > most:
+        raise TruthError(
+            f"truth {truth.path} and the grid take {nx} x {ny} x {nz} voxels of {d:g} m together;"
+            f" expected at most {most}"
+        )
     x, y, z = (volume.origin_m[i] - before[i] * d for i in range(3))
     return Volume((x, y, z), d, (nz, ny, nx)), (before[2], before[1], before[0])

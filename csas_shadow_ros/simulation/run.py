@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import ParameterError, check_range
 from ..core.geometry import TWO_PI, Acoustics, CoherentImage, Track
+from ..core.solid import apart
 from .profiles import Faults, Profile, get_profile
 from .scene import SceneModel
 from .targets import Scene, make_scene
@@ -98,7 +99,13 @@ class Truth:
         Returns
         -------
         stl, json : Path
-            What was written. An empty seabed writes an STL file without triangles.
+            What was written. An empty seabed writes an STL file without triangles. Bodies that touch are
+            written some micrometres apart (`core.solid.apart`): STL has no other way to tell them apart.
+
+        Raises
+        ------
+        GeometryError
+            If the target is not closed: nothing can be measured against such a truth.
         """
         base = Path(path)
         base.parent.mkdir(parents=True, exist_ok=True)
@@ -127,7 +134,7 @@ class Truth:
 
 def _stl(mesh: trimesh.Trimesh) -> bytes:
     if len(mesh.faces):
-        return bytes(trimesh.exchange.stl.export_stl(mesh))
+        return bytes(trimesh.exchange.stl.export_stl(apart(mesh)))
     return b"empty seabed".ljust(80, b" ") + (0).to_bytes(4, "little")
 
 

@@ -33,6 +33,8 @@ ComplexArray = NDArray[np.complex128]
 SUPERSAMPLING = 4
 _RAY_LIFT_M = 1e-3  # rays start this far off the surface, beyond the tracer's float32 rounding
 _ECHO_MARGIN_PX = 4.0
+#: Some 300 bytes each while they are drawn: 600 MB. A laying grid of 20 blocks on `samdis` takes a tenth.
+_MOST_SCATTERERS = 2_000_000
 
 
 def project_shadow(points_m: FloatArray, sonar_m: FloatArray) -> FloatArray:
@@ -115,7 +117,13 @@ class SceneModel:
     def _scatter_on(
         self, solid: trimesh.Trimesh, rng: np.random.Generator, echo_db: float, spacing_m: float
     ) -> None:
-        count = max(64, math.ceil(float(solid.area) / spacing_m**2))
+        needed = float(solid.area) / spacing_m**2
+        if not needed <= _MOST_SCATTERERS:
+            raise GeometryError(
+                f"target has {solid.area:.3g} m² of surface, which take {needed:.2g} scatterers of"
+                f" {spacing_m:.3g} m; expected at most {_MOST_SCATTERERS:.0e}: a mesh in metres"
+            )
+        count = max(64, math.ceil(needed))
         areas = solid.area_faces
         # Sampling by hand: the draws must depend on the seed alone, not on a library's version.
         faces = np.searchsorted(np.cumsum(areas), rng.uniform(0.0, areas.sum(), count))

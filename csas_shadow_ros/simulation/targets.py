@@ -17,6 +17,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from ..core.errors import GeometryError, ParameterError
+from ..core.solid import judge_solid
 
 FloatArray = NDArray[np.float64]
 
@@ -231,12 +232,12 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
 def _rest_on_seabed(mesh: Any, name: str) -> trimesh.Trimesh:
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise GeometryError(f"mesh {name} has no faces; expected a closed surface")
-    closed: trimesh.Trimesh = mesh.copy()
-    if not closed.is_watertight:
-        closed.merge_vertices()  # formats such as STL repeat the corners for each triangle
-    if not closed.is_watertight:
-        raise GeometryError(f"mesh {name} is not closed; expected a watertight surface")
-    trimesh.repair.fix_normals(closed, multibody=True)
+    solid = judge_solid(mesh)
+    if solid.open_edges:
+        raise GeometryError(
+            f"mesh {name} is not closed: it ends at {solid.open_edges} edges; expected a closed surface"
+        )
+    closed = solid.mesh
     low, high = closed.bounds
     closed.apply_translation([-(low[0] + high[0]) / 2.0, -(low[1] + high[1]) / 2.0, -low[2]])
     return closed
