@@ -20,7 +20,7 @@ from .core.parameters import STAGES, PipelineParameters
 
 PROGRAM = "csas-shadow"
 ALL_RUNS = "all"
-OK, FAILED, USAGE = 0, 1, 2
+OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
 #: Shadows may leave the image by so much of its half side before a simulation is said to be too small.
 _MAX_REACH = 1.6
 
@@ -38,7 +38,8 @@ a first try, from nothing to a 3-D shape (half a minute):
   csas-shadow run box_run --out box_results --step-deg 5
   csas-shadow info box_results
 
-exit codes: 0 done, 1 it failed (one line says why), 2 the command line is wrong."""
+exit codes: 0 done, 1 it failed (one line says why), 2 the command line is wrong, 3 the results are
+there, but a part beside the grid failed (a line and report.json say which)."""
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
@@ -222,6 +223,11 @@ def _results_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--overwrite", action="store_true", help="replace a results folder that is there")
     group.add_argument("--no-bag", action="store_true", help="no result.mcap (it holds every view)")
     group.add_argument("--no-figures", action="store_true", help="no figures/")
+    group.add_argument(
+        "--no-sync",
+        action="store_true",
+        help="leave writing out to the disk to the system: a power cut may cost it",
+    )
 
 
 def _parameter_options(parser: argparse.ArgumentParser) -> None:
@@ -263,12 +269,14 @@ def build_parser() -> argparse.ArgumentParser:
     _add_simulate(add)
     check = add(
         "check",
-        "say whether a bag can be processed, what is wrong with it and what to do about it",
-        "  csas-shadow check box_run\n  csas-shadow check box_run --json > report.json\n\n"
-        "exit code 1 if the bag does not honour the topic contract.",
+        "say whether a bag can be processed or a results folder is whole, and what is wrong with it",
+        "  csas-shadow check box_run\n  csas-shadow check box_run --json > report.json\n"
+        "  csas-shadow check box_results\n\n"
+        "exit code 1 if the bag does not honour the topic contract, or if files of the results folder are\n"
+        "missing, changed or not listed.",
         _check,
     )
-    check.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
+    check.add_argument("bag", metavar="BAG|DIR", help="rosbag2 directory, .mcap or .db3 file; or results")
     check.add_argument("--namespace", help="namespace of its topics (found by itself)")
     _run_option(check)
     _common(check)
@@ -612,7 +620,12 @@ def _simulate(arguments: argparse.Namespace, console: Console) -> int:
 
 def _check(arguments: argparse.Namespace, console: Console) -> int:
     from .bags import check_bag
+    from .results import check_results, looks_like_results
 
+    if looks_like_results(arguments.bag):
+        checked = check_results(arguments.bag)
+        console.result(str(checked), checked.as_dict())
+        return OK if checked.ok else FAILED
     report = check_bag(arguments.bag, arguments.namespace, arguments.run)
     console.result(str(report), report.as_dict())
     return OK if report.ok else FAILED
@@ -735,6 +748,7 @@ def _run(arguments: argparse.Namespace, console: Console) -> int:
     parameters = parameters_of(arguments)
     if arguments.workers < 1:
         raise ParameterError(f"workers is {arguments.workers}; expected 1 or more")
+    code = OK
     for number, out in _runs_and_folders(arguments):
         with console.bar("views") as bar:
             report = process_bag(
@@ -748,20 +762,29 @@ def _run(arguments: argparse.Namespace, console: Console) -> int:
                 overwrite=arguments.overwrite,
                 write_bag=not arguments.no_bag,
                 figures=not arguments.no_figures,
+                durable=not arguments.no_sync,
                 workers=arguments.workers,
                 max_objects=arguments.max_objects,
                 command=arguments.command_line,
                 progress=bar,
                 notice=console.notice,
             )
-        _give_report(console, out, report)
-    return OK
+        code = max(code, _give_report(console, out, report))
+    return code
 
 
-def _give_report(console: Console, out: Path, report: dict[str, Any]) -> None:
+def _give_report(console: Console, out: Path, report: dict[str, Any]) -> int:
+    """Tell the result, and give the exit status: a part beside the grid may have failed."""
     from .results import summary
 
-    console.result(f"{summary(report)}results: {out}", report)
+    try:
+        text = summary(report)
+    except Exception:  # the report says why: it was tried there too
+        text = ""
+    console.result(f"{text}results: {out}", report)
+    for part, why in report["failed"].items():
+        print(f"{PROGRAM}: error: {part}: {why}", file=sys.stderr)
+    return PARTIAL if report["failed"] else OK
 
 
 def _replay(arguments: argparse.Namespace, console: Console) -> int:
@@ -769,6 +792,7 @@ def _replay(arguments: argparse.Namespace, console: Console) -> int:
 
     parameters = parameters_of(arguments)
     arguments.namespace = None
+    code = OK
     for number, out in _runs_and_folders(arguments):
         with console.bar("views") as bar:
             report = replay_bag(
@@ -782,12 +806,13 @@ def _replay(arguments: argparse.Namespace, console: Console) -> int:
                 overwrite=arguments.overwrite,
                 write_bag=not arguments.no_bag,
                 figures=not arguments.no_figures,
+                durable=not arguments.no_sync,
                 command=arguments.command_line,
                 progress=bar,
                 notice=console.notice,
             )
-        _give_report(console, out, report)
-    return OK
+        code = max(code, _give_report(console, out, report))
+    return code
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -25,7 +25,7 @@ from .core.pipeline import Result
 from .core.pipeline import run as run_pipeline
 from .core.search.decision import Decision, decide_by_views
 from .core.stages import STAGES, run_views, with_spectrum_sign
-from .results import Context, ResultsWriter, read_truth
+from .results import Context, ResultsWriter
 
 #: What a run can start from; auto takes the first that the bag holds.
 START_FROM = ("auto", "image", *STAGES)
@@ -50,6 +50,7 @@ def process_bag(
     overwrite: bool = False,
     write_bag: bool = True,
     figures: bool = True,
+    durable: bool = True,
     workers: int = 2,
     max_objects: int = MAX_OBJECTS,
     command: Sequence[str] = (),
@@ -74,7 +75,7 @@ def process_bag(
         Namespace of the topics; found by itself if not given.
     run_of_bag : int, optional
         Which of several runs of the bag, as in `read_run`.
-    overwrite, write_bag, figures
+    overwrite, write_bag, figures, durable
         See `ResultsWriter`.
     workers : int
         Threads.
@@ -99,12 +100,14 @@ def process_bag(
         If the bag, a parameter or the folder is not usable.
     """
     p = parameters or PipelineParameters()
-    with ResultsWriter(out, overwrite=overwrite, bag=write_bag, figures=figures) as writer:
+    with ResultsWriter(
+        out, overwrite=overwrite, bag=write_bag, figures=figures, durable=durable, notice=notice
+    ) as writer:
         began = time.perf_counter()
         run = read_run(bag, namespace, run_of_bag)
-        truth = read_truth(bag)
         stage = choose_start(run, start_from)
-        context = Context(p, command, stage=stage, truth=truth, spectrum_sign_override=spectrum_sign)
+        context = Context(p, command, stage=stage, spectrum_sign_override=spectrum_sign)
+        context.read_truth(bag)
         context.timings_s["read"] = time.perf_counter() - began
         if stage == "image":
             result = _from_image(run, context, writer, workers, max_objects, progress, notice)
@@ -115,7 +118,7 @@ def process_bag(
         context.problems = told_once(run.problems)
         for line in context.problems:
             notice(f"problem: {line}")
-        context.input = describe_run(run)
+        context.describe(lambda: describe_run(run))
         return writer.finish(result, context)
 
 
@@ -131,6 +134,7 @@ def replay_bag(
     overwrite: bool = False,
     write_bag: bool = True,
     figures: bool = True,
+    durable: bool = True,
     command: Sequence[str] = (),
     progress: Progress | None = None,
     notice: Notice = _ignore,
@@ -139,8 +143,8 @@ def replay_bag(
 
     Parameters
     ----------
-    bag, out, parameters, start_from, run_of_bag, max_objects, overwrite, write_bag, figures, command
-    progress, notice
+    bag, out, parameters, start_from, run_of_bag, max_objects, overwrite, write_bag, figures, durable
+    command, progress, notice
         See `process_bag`.
     rate : float
         Views: times the recorded speed; 0: as fast as the nodes take them.
@@ -167,10 +171,13 @@ def replay_bag(
     from .replay import replay
 
     p = parameters or PipelineParameters()
-    with ResultsWriter(out, overwrite=overwrite, bag=write_bag, figures=figures) as writer:
+    with ResultsWriter(
+        out, overwrite=overwrite, bag=write_bag, figures=figures, durable=durable, notice=notice
+    ) as writer:
         began = time.perf_counter()
         run = read_run(bag, None, run_of_bag)
-        context = Context(p, command, truth=read_truth(bag))
+        context = Context(p, command)
+        context.read_truth(bag)
         image = None
         stage = start_from
         if choose_start(run, start_from) == "image":
@@ -190,7 +197,8 @@ def replay_bag(
             record=True,
             max_objects=max_objects,
             overrides={
-                "bag_recorder": {"compression": "lz4"},
+                # The results folder that takes the recording is written out to the disk as a whole.
+                "bag_recorder": {"compression": "lz4", "sync": False},
                 "bag_player": {} if run.run_ns is None else {"run": run.run_ns},
             },
             progress=progress or False,
@@ -203,10 +211,10 @@ def replay_bag(
         context.nodes, context.views_lost = node_table(replayed), replayed.lost
         context.views_in = replayed.views_total
         result = adopt_replay(writer, replayed, p, whole=rate == 0.0)
-        (scratch / "log").rename(writer.work / "log")
-        shutil.rmtree(scratch)
+        writer.attempt("log", lambda: (scratch / "log").rename(writer.work / "log"), None)
+        shutil.rmtree(scratch, ignore_errors=True)
         context.problems = [*told_once(run.problems), *unplaced(replayed)]
-        context.input = describe_run(run)
+        context.describe(lambda: describe_run(run))
         return writer.finish(result, context)
 
 

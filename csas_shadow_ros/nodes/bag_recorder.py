@@ -14,6 +14,7 @@ from typing import Any, TextIO
 from csas_shadow_ros.bags import BagReader, BagWriter
 from csas_shadow_ros.core.errors import BagError, ParameterError
 from csas_shadow_ros.core.geometry.runs import TrackBook
+from csas_shadow_ros.durable import sync_tree
 from msg_adapters import STREAMS, TOPICS, message_from_cdr, track_piece_from_msg
 from msg_adapters.topics import RESULT_TOPICS, absolute_name, is_latched, is_topic, split_prefix
 from msg_adapters.topics import topic as topic_of
@@ -179,6 +180,8 @@ class BagRecorderNode(CsasNode):
         if bag.run_ns is not None:
             self._over.add(bag.run_ns)
         bag.writer.close()
+        if self.parameters.sync:
+            sync_tree(bag.path)
 
     # Which bag
 

@@ -168,6 +168,7 @@ class BagRecorderNodeParameters(NodeParameters):
     compression: str = bounded(
         "zstd", "zstd; lz4: a tenth larger, four times as fast", choices=("zstd", "lz4")
     )
+    sync: bool = bounded(True, "write a bag out to the disk at its end, so that a power cut does not cost it")
     topics: str = bounded("all", "topics to record, relative, separated by commas; all: the whole contract")
 
 

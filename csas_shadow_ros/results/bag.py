@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from pathlib import Path
 from typing import Any
+
+from mcap.exceptions import McapError
 
 from msg_adapters.camera_info import GroundInfo
 from msg_adapters.messages import RosbagsMessages
@@ -20,6 +23,7 @@ from msg_adapters.topics import NAMESPACE, RESULT_TOPICS, STREAMS, TOPICS, absol
 from msg_adapters.track import track_to_msg
 
 from ..bags import BagReader, BagWriter
+from ..core.errors import CsasError
 from ..core.geometry import Acoustics, CoherentImage, Track, View
 from ..core.shape.result import Result
 
@@ -159,6 +163,15 @@ class ResultBag:
         for name, message in result_to_msgs(factory, result, stamp_ns=when):
             self._writer.add_topic(absolute_name(name), topic(name).type_name, depth=1)
             self._write(name, message, when)
+
+    def discard(self) -> None:
+        """Close and remove what has been written: the result goes on without a bag."""
+        with contextlib.suppress(CsasError, OSError, McapError):
+            self._writer.close()
+        shutil.rmtree(self._work, ignore_errors=True)
+        for name in (self.FILE, ".recorded.mcap"):
+            with contextlib.suppress(OSError):
+                (self._folder / name).unlink(missing_ok=True)
 
     def abandon(self) -> None:
         """Close what has been written; the folder is not going to be kept."""

@@ -58,7 +58,7 @@ class _Missing(CsasError):
     """A figure cannot be drawn of this run; the message says what is missing."""
 
 
-def draw_all(subject: Subject, folder: Path) -> tuple[list[str], dict[str, str]]:
+def draw_all(subject: Subject, folder: Path) -> tuple[list[str], dict[str, str], dict[str, str]]:
     """Draw every figure that the run allows.
 
     Parameters
@@ -74,21 +74,26 @@ def draw_all(subject: Subject, folder: Path) -> tuple[list[str], dict[str, str]]
         Names of the files written.
     left_out : dict
         Reason for each figure that the run does not allow.
+    failed : dict
+        What went wrong with each that could not be drawn or written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    files, left_out = [], {}
+    files, left_out, failed = [], {}, {}
     with mpl.rc_context(_STYLE):  # type: ignore[arg-type]
         for name, draw in FIGURES.items():
+            path = folder / f"{name}.png"
             try:
                 figure = draw(subject)
+                FigureCanvasAgg(figure)
+                figure.savefig(path, dpi=120)
             except CsasError as error:
                 left_out[name] = str(error)
-                continue
-            path = folder / f"{name}.png"
-            FigureCanvasAgg(figure)
-            figure.savefig(path, dpi=120)
-            files.append(path.name)
-    return files, left_out
+            except Exception as error:  # one figure is not to cost the others
+                failed[f"{folder.name}/{path.name}"] = f"{type(error).__name__}: {error}"
+                path.unlink(missing_ok=True)
+            else:
+                files.append(path.name)
+    return files, left_out, failed
 
 
 # -- pictures ---------------------------------------------------------------------------------------

@@ -78,7 +78,8 @@ def adopt_replay(
         if math.isfinite(lost.aspect_deg):
             result.rejected[lost.aspect_deg] = f"{lost.node}: {lost.reason}"
     if replayed.recording is not None:
-        _show_views(writer, replayed.recording, result, parameters)
+        recording = replayed.recording
+        writer.attempt("views", lambda: _show_views(writer, recording, result, parameters), None)
         writer.adopt_bag(replayed.recording, whole=whole)
     if replayed.composites_grid is not None and {"multilook", "color_by_aspect"} <= set(replayed.composites):
         recorded: Any = RecordedComposites(

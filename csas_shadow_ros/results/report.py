@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import importlib.metadata
 import json
 import math
 import platform
 import sys
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +26,7 @@ from ..core.shape.result import Result, ViewEvidence
 from ..core.shape.verdict import no_object_reason
 from ..core.threshold import thresholded
 from ..core.volume import VoxelGrid
-from .truth import KnownTruth
+from .truth import KnownTruth, TruthError, read_truth
 
 FORMAT = "csas_shadow_ros results 1"
 
@@ -59,6 +61,8 @@ class Context:
         Views that vanished on their way through a graph.
     nodes : mapping or None
         What each node says of its part, if the run went through the node graph.
+    failed : dict
+        What could not be made beside the grid, and why.
     """
 
     parameters: PipelineParameters = field(default_factory=PipelineParameters)
@@ -74,6 +78,21 @@ class Context:
     views_in: int | None = None
     views_lost: int = 0
     nodes: Mapping[str, Any] | None = None
+    failed: dict[str, str] = field(default_factory=dict)
+
+    def read_truth(self, bag: str | Path) -> None:
+        """Take the truth that lies beside a bag; one that cannot be read is named, and the run goes on."""
+        try:
+            self.truth = read_truth(bag)
+        except TruthError as error:
+            self.failed["truth"] = str(error)
+
+    def describe(self, make: Callable[[], Mapping[str, Any]]) -> None:
+        """Take a description of the input; it is made when the run is done, and is not to cost it."""
+        try:
+            self.input = make()
+        except Exception as error:  # the bag may be gone by now, or no longer what it was
+            self.failed["input"] = f"cannot be described: {type(error).__name__}: {error}"
 
 
 def json_ready(value: Any) -> Any:
@@ -90,13 +109,20 @@ def json_ready(value: Any) -> Any:
         return json_ready(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    return value
+    if value is None or isinstance(value, str | int | float):
+        return value
+    return str(value)  # dates, paths and what else a bag's metadata may hold
+
+
+@functools.cache  # a third of a second
+def _distributions() -> Mapping[str, list[str]]:
+    return importlib.metadata.packages_distributions()
 
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, of this package and of every library that is loaded."""
     found = {"python": platform.python_version(), "csas_shadow_ros": __version__}
-    distributions = importlib.metadata.packages_distributions()
+    distributions = _distributions()
     for module in {name.partition(".")[0] for name in sys.modules} - set(sys.stdlib_module_names):
         # Of a package that is one compiled file, only its own name is known.
         for name in distributions.get(module, [module]):
@@ -266,59 +292,58 @@ def build_report(
     result: Result,
     context: Context,
     *,
-    scores: Mapping[str, float] | None,
     other: Dimensions | None,
-    files: Sequence[str],
     figures_left_out: Mapping[str, str],
+    attempt: Callable[[str, Callable[[], Any], Any], Any],
 ) -> dict[str, Any]:
-    """Make the report; everything in it is JSON as it stands.
+    """Make the report without scores and list of files; everything in it is JSON as it stands.
 
     Parameters
     ----------
     result, context : Result, Context
         What was found, and of what.
-    scores : mapping, optional
-        Against the truth (`truth.score`).
     other : Dimensions, optional
         Measures by the other method.
-    files : sequence of str
-        Files of the folder.
     figures_left_out : mapping
         Why figures are not there.
+    attempt : callable
+        Makes a part: its name, what makes it, and what stands there if that fails
+        (`ResultsWriter.attempt`).
     """
     used, lost = result.views_used, len(result.rejected)
-    truth = None
-    if context.truth is not None:
-        truth = {
-            "mesh": str(context.truth.path),
-            "object": context.truth.dimensions is not None,
-            "dimensions": _dimensions(context.truth.dimensions),
-            "scores": dict(scores) if scores else None,
-            "record": context.truth.record,
-        }
     found = result.mesh is not None
     composed = len(result.composites.stamps) if result.composites is not None else 0
+
+    def part(name: str, make: Callable[[], Any], otherwise: Any = None) -> Any:
+        return attempt(f"report: {name}", lambda: json_ready(make()), otherwise)
+
+    no_levels = {"overall": {"views": 0, "estimated": 0}, "by_view": []}
+    no_sign = {"stated": None, "verdict": "not checked", "why": "it cannot be told", "override": None}
     report = {
         "format": FORMAT,
         "object": found,
         "verdict": result.verdict,
         "quality": {"verdict": result.quality.verdict, "reasons": list(result.quality.reasons)},
-        "why_no_object": None if result.objects else no_object_reason(result),
+        "why_no_object": part("why_no_object", lambda: None if result.objects else no_object_reason(result)),
         "run": result.run_ns,
         "arc_deg": math.degrees(result.arc_rad),
-        "objects": _objects(result),
+        "objects": part("objects", lambda: _objects(result), []),
         "objects_left_out": result.left_out,
         "method": context.parameters.carving.method,
-        "dimensions": _dimensions(result.dimensions),
+        "dimensions": part("dimensions", lambda: _dimensions(result.dimensions)),
         "threshold": result.grid.threshold if result.grid is not None else None,
-        "sensitivity": _sensitivity(result.grid, context.parameters.carving),
-        "shadow_heights": _shadow_heights(result),
+        "sensitivity": part("sensitivity", lambda: _sensitivity(result.grid, context.parameters.carving), []),
+        "shadow_heights": part("shadow_heights", lambda: _shadow_heights(result)),
         "target": result.target,
-        "grid": _grid(result.grid),
-        "seabed_slope": _slope(result.grid),
-        "hollows": _hollows(result, scores),
-        "other_method": {"grid": _grid(result.other_grid), "dimensions": _dimensions(other)},
-        "truth": truth,
+        "grid": part("grid", lambda: _grid(result.grid)),
+        "seabed_slope": part("seabed_slope", lambda: _slope(result.grid)),
+        "hollows": part("hollows", lambda: _hollows(result, None)),
+        "other_method": part(
+            "other_method",
+            lambda: {"grid": _grid(result.other_grid), "dimensions": _dimensions(other)},
+            {"grid": None, "dimensions": None},
+        ),
+        "truth": part("truth", lambda: _truth(context.truth)),
         "views": {
             "in": max(used + lost, composed) if context.views_in is None else context.views_in,
             "used": used,
@@ -327,23 +352,67 @@ def build_report(
             "reasons": _reasons(result.rejected.values()),
             "rejected_by_aspect_deg": {f"{a:g}": r for a, r in sorted(result.rejected.items())},
         },
-        "levels": _levels(result.evidence),
-        "spectrum_sign": _sign(result, context),
+        "levels": part("levels", lambda: _levels(result.evidence), no_levels),
+        "spectrum_sign": part("spectrum_sign", lambda: _sign(result, context), no_sign),
         "timings_s": {**result.timings_s, **context.timings_s},
         "stage": context.stage,
         "through": "one process" if context.nodes is None else "node graph",
         "nodes": context.nodes,
-        "input": context.input,
+        "input": part("input", lambda: context.input, {}),
         "problems": list(context.problems),
         "parameters": dataclasses.asdict(context.parameters),
         "command": list(context.command),
-        "versions": versions(),
+        "versions": part("versions", versions, {"csas_shadow_ros": __version__}),
         "platform": platform.platform(),
-        "files": sorted(files),
+        "files": [],
         "figures_left_out": dict(figures_left_out),
+        "failed": {},
     }
     ready: dict[str, Any] = json_ready(report)
     return ready
+
+
+def _truth(truth: KnownTruth | None) -> dict[str, Any] | None:
+    if truth is None:
+        return None
+    return {
+        "mesh": str(truth.path),
+        "object": truth.has_object,
+        "dimensions": _dimensions(truth.dimensions),
+        "scores": None,
+        "record": truth.record,
+        "problem": truth.problem or None,
+        "notes": list(truth.notes),
+    }
+
+
+def complete_report(
+    report: dict[str, Any],
+    result: Result,
+    context: Context,
+    *,
+    scores: Mapping[str, float] | None,
+    figures_left_out: Mapping[str, str],
+) -> None:
+    """Put into a report what is made last.
+
+    Parameters
+    ----------
+    report : dict
+        By `build_report`.
+    result, context : Result, Context
+        What was found, and of what.
+    scores : mapping, optional
+        Against the truth (`truth.score`).
+    figures_left_out : mapping
+        Why figures are not there.
+    """
+    if scores is not None:
+        report["truth"]["scores"] = json_ready(scores)
+        report["hollows"] = json_ready(_hollows(result, scores))
+    report["figures_left_out"] = dict(figures_left_out)
+    report["timings_s"] = json_ready({**result.timings_s, **context.timings_s})
+    report["versions"] = versions()  # figures load some more
 
 
 def _reasons(reasons: Iterable[str]) -> dict[str, int]:
@@ -397,7 +466,10 @@ def summary(report: Mapping[str, Any]) -> str:
         for label, key, unit in rows:
             values = [d["position_m"][key] if isinstance(key, int) else d[key] for d in (mine, true) if d]
             digits = 1 if unit == "°" else 4 if unit == "m³" else 3
-            cells = [f"{round(value, digits) + 0.0:.{digits}f} {unit}" for value in values]  # no -0
+            cells = [
+                "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f} {unit}"  # no -0
+                for value in values
+            ]
             if not mine:
                 cells.insert(0, "-")
             if intervals:
@@ -406,7 +478,7 @@ def summary(report: Mapping[str, Any]) -> str:
                 half = (high - low) / 2.0 * (180.0 / math.pi if name == "heading_rad" else 1.0)
                 cells.insert(1, f"± {half:.{digits}f} {unit}")
             line = f"{label:<14}" + "".join(f"{cell:>12}" for cell in cells)
-            if mine and true:
+            if mine and true and None not in values:
                 off = values[0] - values[1]
                 if unit == "°":
                     off = (off + 90.0) % 180.0 - 90.0
@@ -464,6 +536,8 @@ def summary(report: Mapping[str, Any]) -> str:
     if sign["override"] is not None:
         lines.append(f"spectrum sign was overridden to {sign['override']:+d} on the command line")
     lines += [f"problem with the input: {problem}" for problem in report["problems"]]
+    lines += [f"truth: {note}" for note in truth.get("notes", ())]
+    lines += [f"failed: {part}: {why}" for part, why in report.get("failed", {}).items()]
     total = sum(v for v in report["timings_s"].values() if v is not None)
     lines.append(f"time: {total:.1f} s")
     return "\n".join(lines) + "\n"

@@ -177,9 +177,7 @@ def test_a_truth_that_takes_more_memory_than_a_run_is_refused_before_it_is_taken
 
 
 def test_a_truth_nearly_as_high_as_the_sonar_is_refused_before_its_shadow_is_drawn():
-    with pytest.raises(
-        CsasError, match=r"shadow takes 2\.6e\+05 x .* points of 0\.0025 m; expected at most"
-    ):
+    with pytest.raises(CsasError, match=r"shadow takes 2\.6e\+05 x .* points of 0\.0025 m; expected at most"):
         shadow_hull(a_box((2.0, 2.0, 5.9), (0, 0, 2.95)), SONAR, carved(BOX).volume)
 
 
