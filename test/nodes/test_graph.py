@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -428,6 +429,25 @@ def test_a_killed_recorder_is_followed_by_one_that_keeps_what_was_recorded(
     assert run.counts["likelihood"] == 36
     assert run.problems == []
     assert not out.with_name("recording.cut").exists()
+
+
+@pytest.mark.parametrize("sync", [True, False])
+def test_a_recorder_writes_its_bag_out_to_the_disk_at_its_end_unless_told_otherwise(
+    graph: Graph, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sync: bool
+) -> None:
+    out = tmp_path / "recording"
+    recorder = graph.add(BagRecorderNode, out=str(out), sync=sync)
+    synced, fsync = set(), os.fsync
+
+    def noted(number: int) -> None:
+        synced.add(os.fstat(number).st_ino)
+        fsync(number)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    recorder.stop()
+    there = [*out.iterdir(), out, tmp_path]
+    assert {p.name for p in there} >= {"metadata.yaml", "recording_0.mcap"}
+    assert {p.stat().st_ino in synced for p in there} == {sync}
 
 
 def test_a_bag_is_recorded_by_one_recorder_at_a_time(graph: Graph, tmp_path: Path) -> None:
