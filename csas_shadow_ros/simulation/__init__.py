@@ -4,14 +4,18 @@ from .bag import simulate_bag
 from .hull import iou, shadow_hull, voxelise_truth
 from .profiles import PROFILES, Faults, Profile, get_profile
 from .run import SimulatedRun, Truth, simulate
+from .seabed import Bump, Patch, Seabed
 from .targets import TARGETS, Scene, load_mesh, make_scene
 
 __all__ = [
     "PROFILES",
     "TARGETS",
+    "Bump",
     "Faults",
+    "Patch",
     "Profile",
     "Scene",
+    "Seabed",
     "SimulatedRun",
     "Truth",
     "get_profile",

@@ -163,6 +163,20 @@ class Faults:
         The image's metadata claims (1 + this) times the true sound speed.
     seabed_slope_db : float
         Seabed level rises by this much over the image, west to east.
+    track_offset_m : (float, float)
+        Centre (x, y) of the circle. The track reports it faithfully, as it does the next two.
+    ellipse, ellipse_deg : float
+        The track's semi-axes are (1 ± this) times the radius, the long one in this direction.
+    spiral_m : float
+        How much farther out the sonar is at the end of the circle than at its start.
+    tilt_deg, tilt_towards_deg : float
+        The seabed rises by this slope in this direction against the level that the track refers to: the
+        sonar is lower over the seabed there than the track says. The scene lies in the seabed's plane.
+    drift_m : (float, float)
+        Position error (x, y) that grows evenly along the track, from minus to plus half of this, and is in
+        the image, not in the track.
+    radial_shift_m : float
+        Every aspect is imaged so much too near to its sonar.
 
     Raises
     ------
@@ -180,6 +194,14 @@ class Faults:
     wrong_sign: bool = False
     sound_speed_error: float = 0.0
     seabed_slope_db: float = 0.0
+    track_offset_m: tuple[float, float] = (0.0, 0.0)
+    ellipse: float = 0.0
+    ellipse_deg: float = 0.0
+    spiral_m: float = 0.0
+    tilt_deg: float = 0.0
+    tilt_towards_deg: float = 0.0
+    drift_m: tuple[float, float] = (0.0, 0.0)
+    radial_shift_m: float = 0.0
 
     def __post_init__(self) -> None:
         check_range("contrast_db", self.contrast_db, 0.1, 100.0, "dB")
@@ -190,7 +212,19 @@ class Faults:
         check_range("quadratic_arc_deg", self.quadratic_arc_deg, 0.5, 360.0, "deg")
         check_range("sound_speed_error", self.sound_speed_error, -0.5, 1.0)
         check_range("seabed_slope_db", self.seabed_slope_db, -60.0, 60.0, "dB")
+        check_range("ellipse", self.ellipse, 0.0, 0.5)
+        check_range("spiral_m", self.spiral_m, -1e5, 1e5, "m")
+        check_range("tilt_deg", self.tilt_deg, 0.0, 30.0, "deg")
+        check_range("radial_shift_m", self.radial_shift_m, -1e3, 1e3, "m")
+        for name in ("track_offset_m", "drift_m"):
+            for value in getattr(self, name):
+                check_range(name, value, -1e5, 1e5, "m")
         object.__setattr__(self, "missing_arcs_deg", _check_arcs(self.missing_arcs_deg))
+
+    @property
+    def leaves_circle(self) -> bool:
+        """Whether the track is no circle about the scene's origin, wobble left out."""
+        return self.track_offset_m != (0.0, 0.0) or self.ellipse != 0.0 or self.spiral_m != 0.0
 
 
 def _check_arcs(arcs: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], ...]:

@@ -44,6 +44,7 @@ from ..core.geometry import TWO_PI, Acoustics, CoherentImage, Track
 from ..core.solid import apart
 from .profiles import Faults, Profile, get_profile
 from .scene import SceneModel
+from .seabed import Seabed, SeabedModel
 from .targets import Scene, make_scene
 
 FloatArray = NDArray[np.float64]
@@ -224,22 +225,64 @@ def _smooth_round_circle(rng: np.random.Generator, modes: int) -> Callable[[Any]
 
 
 class _Orbit:
-    """True sonar position at each aspect: the circle, and smooth departures in range and height."""
+    """True sonar position at each aspect: the circle (or what the faults make of it), and smooth departures
+    in range and height."""
 
-    def __init__(self, profile: Profile, wobble_m: float, rng: np.random.Generator) -> None:
-        self._profile, self._wobble = profile, wobble_m
+    def __init__(
+        self,
+        profile: Profile,
+        faults: Faults,
+        rng: np.random.Generator,
+        *,
+        clockwise: bool = False,
+        start_aspect_deg: float = 0.0,
+    ) -> None:
+        self._profile, self._faults, self._wobble = profile, faults, faults.track_wobble_m
+        self._start, self._sense = math.radians(start_aspect_deg), -1.0 if clockwise else 1.0
         # A track described by range and height as functions of its aspect misses nothing: a departure along
         # the circle only changes when the aspect is reached.
         self._range, self._height = (_smooth_round_circle(rng, _WOBBLE_MODES) for _ in range(2))
 
+    def passed(self, aspect_rad: Any) -> Any:
+        """Return which share of the circle was passed before each aspect, in [0, 1)."""
+        return np.mod(self._sense * (np.asarray(aspect_rad, np.float64) - self._start), TWO_PI) / TWO_PI
+
+    def _mean_range(self, aspect_rad: FloatArray) -> Any:
+        f, r = self._faults, self._profile.radius_m
+        turned = aspect_rad - math.radians(f.ellipse_deg)
+        a, b = 1.0 + f.ellipse, 1.0 - f.ellipse
+        out = r * (a * b / np.hypot(b * np.cos(turned), a * np.sin(turned)))
+        out = out + f.spiral_m * (self.passed(aspect_rad) - 0.5)
+        # A circle about another centre, as seen from the origin: |ρ û - offset| = its radius.
+        x, y = f.track_offset_m
+        along = x * np.cos(aspect_rad) + y * np.sin(aspect_rad)
+        return along + np.sqrt(np.maximum(out**2 - (x**2 + y**2) + along**2, 0.0))
+
     def at(self, aspect_rad: FloatArray) -> FloatArray:
+        """Return positions as the track reports them."""
         r = self._profile.radius_m + self._wobble * self._range(aspect_rad)
         z = self._profile.height_m + self._wobble * self._height(aspect_rad)
+        if self._faults.leaves_circle:
+            r = r - self._profile.radius_m + self._mean_range(aspect_rad)
         if np.min(z) <= 0.0 or np.min(r) <= 0.0:
             raise ParameterError(
                 f"track_wobble_m is {self._wobble:g} m; expected one that keeps the sonar above the seabed"
             )
         return np.stack([r * np.cos(aspect_rad), r * np.sin(aspect_rad), z], axis=-1)
+
+    def over_seabed(self, reported: FloatArray) -> FloatArray:
+        """Return where the sonar really was over the seabed, of positions as reported."""
+        if self._faults.tilt_deg == 0.0:
+            return reported
+        towards = math.radians(self._faults.tilt_towards_deg)
+        rise = math.tan(math.radians(self._faults.tilt_deg))
+        rises = (reported[:, :2] @ np.array([math.cos(towards), math.sin(towards)])) * rise
+        true = reported - np.column_stack([np.zeros((len(rises), 2)), rises])
+        if np.min(true[:, 2]) <= 0.0:
+            raise ParameterError(
+                f"tilt_deg is {self._faults.tilt_deg:g}; expected one that keeps the sonar above the seabed"
+            )
+        return true
 
 
 def _in_arcs(aspect_deg: Any, arcs: tuple[tuple[float, float], ...]) -> Any:
@@ -249,15 +292,25 @@ def _in_arcs(aspect_deg: Any, arcs: tuple[tuple[float, float], ...]) -> Any:
     return inside
 
 
-def _phase_error(faults: Faults, rng: np.random.Generator) -> Callable[[Any], Any] | None:
+def _phase_error(
+    faults: Faults, rng: np.random.Generator, orbit: _Orbit, k_centre: float
+) -> Callable[[Any], Any] | None:
+    """Return the phase error at K(f_c) by aspect; it is in proportion to K."""
     smooth = _smooth_round_circle(rng, _PHASE_ERROR_MODES)
-    if faults.phase_error_rad == 0.0 and faults.quadratic_phase_rad == 0.0:
+    displaced = faults.drift_m != (0.0, 0.0) or faults.radial_shift_m != 0.0
+    if faults.phase_error_rad == 0.0 and faults.quadratic_phase_rad == 0.0 and not displaced:
         return None
     arc = math.radians(faults.quadratic_arc_deg)
 
     def phase(aspect_rad: Any) -> Any:
         within = np.mod(aspect_rad, arc) / arc - 0.5
-        return faults.phase_error_rad * smooth(aspect_rad) + faults.quadratic_phase_rad * (2.0 * within) ** 2
+        error = faults.phase_error_rad * smooth(aspect_rad) + faults.quadratic_phase_rad * (2.0 * within) ** 2
+        if displaced:
+            # What is imaged at p + δ instead of p has the phase -K·δ; δ along û counts alone.
+            angle = np.asarray(aspect_rad, dtype=np.float64)
+            along = faults.drift_m[0] * np.cos(angle) + faults.drift_m[1] * np.sin(angle)
+            error = error - k_centre * (along * (orbit.passed(angle) - 0.5) + faults.radial_shift_m)
+        return error
 
     return phase
 
@@ -280,8 +333,10 @@ class _BlockMaker:
         seabed: NDArray[np.complex64],
         slope_db: float,
         arcs: tuple[tuple[float, float], ...],
+        bed: SeabedModel | None = None,
     ) -> None:
         self.profile, self.wedges, self.model, self.seabed = profile, wedges, model, seabed
+        self.bed = bed
         self.slope_db, self.arcs = slope_db, arcs
         d = profile.spacing_m
         extent = np.array([profile.rows * d, profile.cols * d])
@@ -316,12 +371,14 @@ class _BlockMaker:
         q0, n_rows = self._box(q, int(self.margin[0]), rows)
         p0, n_cols = self._box(p, int(self.margin[1]), cols)
         lit, window = self.model.lit_fraction(sonar_m, self.profile.grid, n_rows, n_cols)
-        if lit is None and self.slope_db == 0.0:
+        if lit is None and self.slope_db == 0.0 and self.bed is None:
             return self.seabed[q % rows, p % cols]
         # White on the image's lattice, the seabed has a spectrum that repeats beyond it.
         box = self.seabed[np.ix_((q0 + np.arange(n_rows)) % rows, (p0 + np.arange(n_cols)) % cols)]
         picture = ducc0.fft.c2c(box, axes=(0, 1), forward=False, inorm=2, nthreads=1)
-        if lit is not None:
+        if self.bed is not None:
+            picture *= self.bed.seen(sonar_m, lit, window, n_rows, n_cols)
+        elif lit is not None:
             picture[window] *= lit
         if self.slope_db != 0.0:
             across = np.arange(n_cols) / n_cols - 0.5
@@ -364,6 +421,7 @@ def simulate(
     faults: Faults | None = None,
     spectrum_sign: int = 1,
     echo_db: float = 12.0,
+    bed: Seabed | None = None,
     clockwise: bool = False,
     start_aspect_deg: float = 0.0,
     workers: int | None = None,
@@ -389,6 +447,8 @@ def simulate(
         σ of the image: +1 or -1.
     echo_db : float
         Target's scattering strength at normal incidence over the seabed's.
+    bed : Seabed, optional
+        Levels and relief of the seabed; flat and of one level by default.
     clockwise : bool
         Which way the sonar goes round.
     start_aspect_deg : float
@@ -423,9 +483,9 @@ def simulate(
             f"position_m is {position_m} and heading_deg {heading_deg:g}; expected neither with a ready scene"
         )
     streams = [np.random.default_rng([seed, i]) for i in range(4)]
-    orbit = _Orbit(profile, faults.track_wobble_m, streams[0])
-    phase = _phase_error(faults, streams[1])
+    orbit = _Orbit(profile, faults, streams[0], clockwise=clockwise, start_aspect_deg=start_aspect_deg)
     k_low, k_centre, k_high = profile.band_rad_m
+    phase = _phase_error(faults, streams[1], orbit, k_centre)
     model = SceneModel(
         scene,
         seed=seed,
@@ -437,7 +497,10 @@ def simulate(
     )
     wedges = Wedges.of(profile)
     seabed = _white(streams[2], (profile.rows, profile.cols))
-    maker = _BlockMaker(profile, wedges, model, seabed, faults.seabed_slope_db, faults.missing_arcs_deg)
+    bed_model = None if bed is None or bed.is_plain else SeabedModel(bed, profile.grid)
+    maker = _BlockMaker(
+        profile, wedges, model, seabed, faults.seabed_slope_db, faults.missing_arcs_deg, bed_model
+    )
 
     # |I| is Rayleigh with mode 1 where E|I|² = 2; noise and seabed share that so that seabed with noise
     # over noise alone is the contrast.
@@ -451,7 +514,7 @@ def simulate(
     spectrum = np.zeros((profile.rows, profile.cols), dtype=np.complex64)
     blocks = len(wedges)
     aspects = (np.arange(blocks) + 0.5) * (TWO_PI / blocks)
-    sonar = orbit.at(aspects.astype(np.float64))
+    sonar = orbit.over_seabed(orbit.at(aspects.astype(np.float64)))
 
     threads = workers or os.cpu_count() or 1
 
@@ -494,7 +557,7 @@ def simulate(
         profile=profile,
         faults=faults,
         acoustics=true_acoustics,
-        sonar_m=positions,
+        sonar_m=orbit.over_seabed(positions),
     )
     return SimulatedRun(image, Track(stamps, reported), truth)
 
