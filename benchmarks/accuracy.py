@@ -452,7 +452,7 @@ def code_fingerprint() -> str:
     """Return a digest of what decides the numbers: a run is not gone on with after that has changed."""
     digest = hashlib.sha256()
     package = Path(csas_shadow_ros.__file__).parent
-    for source in sorted([*(package / "core").glob("*.py"), *(package / "simulation").glob("*.py")]):
+    for source in sorted([*(package / "core").rglob("*.py"), *(package / "simulation").rglob("*.py")]):
         digest.update(source.name.encode() + b"\0" + source.read_bytes())
     return digest.hexdigest()[:16]
 
