@@ -74,6 +74,10 @@ def _one_thread() -> None:
 
 
 def _score_all(half: str, todo: Sequence[int], shapes: Path, workers: int) -> Iterator[Row]:
+    if workers == 1:
+        for index in todo:
+            yield score_scene(half, index, shapes)
+        return
     # The variables are read when the libraries are loaded: they are for the processes that start now.
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     context = multiprocessing.get_context("spawn")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import trimesh
@@ -367,18 +368,25 @@ class Body:
 
     def mesh(self) -> trimesh.Trimesh:
         """Return what of it is above the seabed, in the scene frame."""
-        family = next(half[self.family] for half in FAMILIES.values() if self.family in half)
-        parts = family.make(np.random.default_rng([self.seed, 0xB0]))
-        scale = np.diag([self.size_m / float(np.ptp(bounds_of(parts), axis=0).max())] * 3 + [1.0])
-        left = settled(
-            transformed(parts, scale),
-            tilt_rad=math.radians(self.tilt_deg),
-            about_rad=math.radians(self.about_deg),
-            buried=self.buried,
-        )
-        pose = trimesh.transformations.rotation_matrix(math.radians(self.heading_deg), (0.0, 0.0, 1.0))
-        pose[:2, 3] = self.place_m
-        return join_bodies(transformed(left, pose))
+        mesh = _lying(replace(self, place_m=(0.0, 0.0))).copy()
+        mesh.apply_translation((*self.place_m, 0.0))
+        return mesh
+
+
+@lru_cache(maxsize=64)
+def _lying(body: Body) -> trimesh.Trimesh:
+    """Make a body at the origin; drawing a scene asks for the same few again and again."""
+    family = next(half[body.family] for half in FAMILIES.values() if body.family in half)
+    parts = family.make(np.random.default_rng([body.seed, 0xB0]))
+    scale = np.diag([body.size_m / float(np.ptp(bounds_of(parts), axis=0).max())] * 3 + [1.0])
+    left = settled(
+        transformed(parts, scale),
+        tilt_rad=math.radians(body.tilt_deg),
+        about_rad=math.radians(body.about_deg),
+        buried=body.buried,
+    )
+    turn = trimesh.transformations.rotation_matrix(math.radians(body.heading_deg), (0.0, 0.0, 1.0))
+    return join_bodies(transformed(left, turn))
 
 
 @dataclass(frozen=True)
@@ -574,7 +582,7 @@ def _draw_body(rng: Rng, half: str, family: str, size_m: float, chosen: Iterable
 
 
 def _moved(body: Body, x: float, y: float) -> Body:
-    return Body(**{**asdict(body), "place_m": (float(x), float(y))})
+    return replace(body, place_m=(float(x), float(y)))
 
 
 def _reach_m(body: Body) -> float:
