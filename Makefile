@@ -15,6 +15,8 @@ DEMO_OUT ?= results/demo
 PYTEST_WORKERS ?= 2
 # More arguments of the accuracy benchmark: make accuracy ACCURACY_ARGUMENTS=--resume
 ACCURACY_ARGUMENTS ?=
+# Of the population: make population POPULATION_ARGUMENTS='--half test --scenes 500 --out FOLDER'
+POPULATION_ARGUMENTS ?= --half development --scenes 60 --workers 2 --out build/population
 # And of the speed benchmark: make bench BENCH_ARGUMENTS='--only chain carving'
 BENCH_ARGUMENTS ?=
 
@@ -28,7 +30,7 @@ SOURCES := $(shell find csas_shadow_ros msg_adapters config launch -type f \
 	-not -name '*.pyc' -not -path '*/__pycache__*' 2>/dev/null)
 PACKAGING := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help venv install demo test lint types unit accuracy accuracy-short bench build clean
+.PHONY: help venv install demo test lint types unit accuracy accuracy-short population bench build clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -75,6 +77,9 @@ accuracy-short: install ## a few cases of it against their floors, in a minute
 
 accuracy: install ## the accuracy benchmark: writes docs/accuracy.md
 	$(PY) benchmarks/accuracy.py $(ACCURACY_ARGUMENTS)
+
+population: install ## scenes drawn at random, development half: writes build/population/page.md
+	$(PY) benchmarks/population.py $(POPULATION_ARGUMENTS)
 
 bench: install ## the speed benchmark: a table of bounds, docs/performance.json and figure
 	@mkdir -p $(ROS_LOG_DIR)

@@ -208,7 +208,7 @@ class SeabedModel:
         grid = self._grid
         x = grid.x_min_m + np.arange(cols) * (grid.cols * grid.spacing_m / cols)
         y = grid.y_max_m - np.arange(rows) * (grid.rows * grid.spacing_m / rows)
-        return x[None, :], y[:, None]
+        return np.asarray(x[None, :], np.float64), np.asarray(y[:, None], np.float64)
 
     def _on(self, rows: int, cols: int) -> tuple[Any, Any]:
         """Return amplitude and height on a lattice over the image; None for what there is not."""
@@ -238,7 +238,7 @@ class SeabedModel:
         ndarray of float32, shape (rows, cols)
         """
         level, height = self._on(rows, cols)
-        whole = np.ones((rows, cols), np.float32)
+        whole: Any = np.ones((rows, cols), np.float32)
         if lit is not None:
             whole[window] = lit
         if height is not None:
