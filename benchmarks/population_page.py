@@ -307,9 +307,9 @@ def page(rows: Sequence[Row], half: str, figures: Mapping[str, str]) -> str:
         "- radius log-uniform, 20 to 150 m (more where the body is large for it); grazing angle uniform,"
         " 6° to 35°",
         "- contrast uniform, 4 to 18 dB; echo: none in a fifth of the scenes, else uniform, 0 to 20 dB",
-        "- band: bandwidth 25 to 45 % of its middle; 10 to 40 cross-range cells along the body, as far as an"
-        f" image of {MOST_PIXELS} pixels holds body and shadow; voxel 0.65 of a cell, 2 cm where"
-        " that is near",
+        "- band: bandwidth 25 to 45 % of its middle; 10 to 40 cross-range cells along the body and two"
+        f" or more across it, as far as an image of {MOST_PIXELS} pixels holds body and shadow; voxel 0.65"
+        " of a cell, 2 cm where that is near",
         f"- oversampling 1.5, 2 or 3; views every {STEP_DEG:g}°",
         f"- so many of the following at once: {shares}",
         *(f"- {name}: {text}" for name, text in COMPLICATION_TEXT.items()),

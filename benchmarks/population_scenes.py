@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 import trimesh
 
+from csas_shadow_ros.core.mesh import measure
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
 from csas_shadow_ros.simulation import Bump, Faults, Patch, Profile, Scene, Seabed, SimulatedRun, simulate
 from csas_shadow_ros.simulation.bodies import (
@@ -29,9 +30,11 @@ from csas_shadow_ros.simulation.targets import empty_mesh, join_bodies
 DEVELOPMENT, TEST = "development", "test"
 HALVES = (DEVELOPMENT, TEST)
 #: Changes with what `draw` draws: rows of another one are of other scenes.
-DRAWING = 1
+DRAWING = 2
 #: Views every 6°, half an aperture: time goes with their number.
 STEP_DEG = 6.0
+#: The main body is at least so many cross-range cells wide: what is thinner leaves no shadow to speak of.
+LEAST_CELLS = 2.0
 #: Side of the largest image that is drawn.
 MOST_PIXELS = 1408
 
@@ -550,7 +553,7 @@ def draw(half: str, index: int) -> SceneSpec:
     """
     if half not in HALVES:
         raise ValueError(f"half is {half!r}; expected one of: {', '.join(HALVES)}")
-    rng = np.random.default_rng([HALVES.index(half), index, DRAWING, 0x909])
+    rng = np.random.default_rng([HALVES.index(half), index, 1, 0x909])
     turn, place = divmod(index, 5)
     with_object = place in _OBJECT_SCENES
     if with_object:
@@ -644,15 +647,26 @@ def _draw_run(
         bounds = np.array([body.mesh().bounds for body in (*bodies, *clutter)])
         top = float(bounds[:, 1, 2].max())
         radius = max(_log_uniform(rng, 20.0, 150.0), 8.0 * size, 4.0 * top / math.tan(math.radians(grazing)))
-        sonar = radius * math.tan(math.radians(grazing))
         corners = np.abs(bounds[:, :, :2]).max(axis=1)
-        half_side = max(
-            math.hypot(*corner) + shadow_length_m(b[1, 2], radius + size, sonar)
-            for corner, b in zip(corners, bounds, strict=True)
-        )
-        # 10 to 40 cells along the body, as far as the image may have pixels for it.
+
+        def needed_m(grazing_deg: float) -> float:
+            """Return half of the side that bodies and shadows need."""
+            sonar = radius * math.tan(math.radians(grazing_deg))
+            return max(
+                math.hypot(*corner) + shadow_length_m(b[1, 2], radius + size, sonar)
+                for corner, b in zip(corners, bounds, strict=True)
+            )
+
+        # 10 to 40 cells along the body and at least two across it, as far as the image may have pixels for
+        # it; what is too thin for its long shadow then is seen from higher up.
         cell = size / _log_uniform(rng, 10.0, 40.0)
+        across = measure(bodies[0].mesh()).width_m / LEAST_CELLS
+        cell = min(cell, across)
         spacing = cell / _cell_m(1.0, bandwidth)
+        coarsest = across / _cell_m(1.0, bandwidth)
+        while 2.0 * needed_m(grazing) > (MOST_PIXELS - 64) * coarsest and grazing < 35.0:
+            grazing = min(grazing + 1.0, 35.0)
+        half_side = needed_m(grazing)
         half_side += 3.0 * cell
         if "cropped" in complications:
             half_side *= _uniform(rng, 0.45, 0.8)

@@ -111,6 +111,14 @@ def test_every_family_of_both_halves_is_made_of_closed_parts_tilted_and_sunk(pop
                 assert max(longest, np.ptp(upright.bounds[:, 2])) >= 1.29, name
 
 
+def test_every_main_body_is_wide_enough_to_be_seen_and_scored(population, drawn):
+    for half, specs in drawn.items():
+        for spec in (spec for spec in specs if spec.bodies and "cropped" not in spec.complications):
+            body = population.TrueBody(spec.meshes()[0], SONAR, spec.voxel_m)
+            assert body.sizes()["width_m"] >= 1.6 * spec.cell_m, (half, spec.index, spec.family)
+            assert population.voxelise_truth(body.mesh, body.own_volume(spec.voxel_m)).sum() >= 8, spec.name
+
+
 def test_shadows_are_in_the_image_unless_it_is_cropped(population, drawn):
     for spec in drawn["development"]:
         if not spec.bodies or "cropped" in spec.complications:
