@@ -36,7 +36,7 @@ from csas_shadow_ros.core.parameters import (
 )
 from csas_shadow_ros.core.streaming import Stream
 from csas_shadow_ros.core.volume import Target
-from csas_shadow_ros.graph import Graph, free_domain_id
+from csas_shadow_ros.graph import DomainReservation, Graph
 from csas_shadow_ros.replay import _Watcher, node_parameters
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.sectors import sectors_of_run
@@ -83,7 +83,8 @@ def play(bag: Path, parameters: PipelineParameters, rate: float, publish_hz: flo
     plan["bag_player"] = {"bag": str(bag), "stage": "sector", "rate": rate, "min_sinks": 1}
     arrived: dict[int, float] = {}
     grids: list[tuple[float, int]] = []
-    domain = free_domain_id()
+    reserved = DomainReservation()
+    domain = reserved.domain_id
 
     def take(into: Any, message: Any) -> None:
         stamp = stamp_to_ns(message.header.stamp)
@@ -115,6 +116,7 @@ def play(bag: Path, parameters: PipelineParameters, rate: float, publish_hz: flo
             }
         finally:
             watcher.close()
+            reserved.close()
     order = sorted(arrived)
     delays = []
     for sector in order:

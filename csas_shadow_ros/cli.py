@@ -511,6 +511,12 @@ def _replay_options(p: argparse.ArgumentParser) -> None:
         metavar="R",
         help="views: times the recorded speed; 0: as fast as the nodes take them (default 0)",
     )
+    p.add_argument(
+        "--domain-id",
+        type=int,
+        metavar="N",
+        help="ROS domain, to look on: ROS_DOMAIN_ID=N ros2 topic list (default: one that nobody uses)",
+    )
     _run_option(p, each=True)
     _bounded_objects(p)
     _results_options(p)
@@ -801,6 +807,7 @@ def _replay(arguments: argparse.Namespace, console: Console) -> int:
                 parameters,
                 start_from=arguments.start_from,
                 rate=arguments.rate,
+                domain_id=arguments.domain_id,
                 run_of_bag=number,
                 max_objects=arguments.max_objects,
                 overwrite=arguments.overwrite,

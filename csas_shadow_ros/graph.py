@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 import time
+import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent import futures
@@ -24,12 +25,16 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import IO, Any
 
+from msg_adapters.progress import GRAPH_ID
+
 from .core.errors import CsasError
 from .nodes.params import check, yaml_text
 
 PACKAGE = "csas_shadow_ros"
 #: The ports of higher domains do not exist.
 MAX_DOMAIN_ID = 232
+#: Of a domain's ports 0 and 1 are its multicast ones, and 10 and up its participants': this one is nobody's.
+_HELD = 9
 #: The first to be started are those that have most to do before there is a view.
 _START_ORDER = (
     "bag_player",
@@ -82,23 +87,92 @@ def config_file(name: str) -> Path:
     raise ReplayError(f"{name} is nowhere; expected it at one of: {', '.join(map(str, places))}")
 
 
-def free_domain_id() -> int:
-    """Return a ROS domain whose discovery port nobody on this machine uses.
+class DomainReservation:
+    """A ROS domain that no other replay on this machine takes, until it is closed or its process ends.
+
+    What holds it is a UDP port of the domain that no participant uses: whoever shares the participants' ports
+    shares it too, users and containers alike, and it is free again whatever ends the process.
+
+    Parameters
+    ----------
+    domain_id : int, optional
+        The domain to reserve; one of which no port is in use otherwise.
 
     Raises
     ------
     ReplayError
-        If all are in use.
+        If it is reserved already, or all domains are in use.
+
+    Examples
+    --------
+    >>> with DomainReservation() as domain_id:
+    ...     1 <= domain_id <= 101
+    True
     """
-    # Linux hands out ports from 32768 on to whoever asks: domains up to 101 lie below them.
-    for domain in random.sample(range(1, 102), 101):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(("", 7400 + 250 * domain))
-            except OSError:
+
+    def __init__(self, domain_id: int | None = None) -> None:
+        if domain_id is not None:
+            held = _bound(_ports_of(domain_id)[0] + _HELD)
+            if held is None:
+                raise ReplayError(
+                    f"ROS domain {domain_id} is taken by another replay on this machine (UDP port"
+                    f" {_ports_of(domain_id)[0] + _HELD}); expected a domain of its own"
+                )
+            self.domain_id, self._held = domain_id, held
+            return
+        # Linux hands out ports from 32768 on to whoever asks: domains up to 101 lie below them.
+        for domain in random.sample(range(1, 102), 101):
+            held = _bound(_ports_of(domain)[0] + _HELD)
+            if held is None:
                 continue
-            return domain
-    raise ReplayError("every ROS domain from 1 to 101 is in use on this machine")
+            # Reserved first, then looked at: nobody else begins to use it in between.
+            if _unused(domain):
+                self.domain_id, self._held = domain, held
+                return
+            held.close()
+        raise ReplayError("every ROS domain from 1 to 101 is in use on this machine")
+
+    def __enter__(self) -> int:
+        return self.domain_id
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let others have it."""
+        self._held.close()
+
+
+def _ports_of(domain_id: int) -> range:
+    """Return the UDP ports of a domain (the OMG's DDSI-RTPS, 9.6.1.1)."""
+    return range(7400 + 250 * domain_id, 7400 + 250 * (domain_id + 1))
+
+
+def _bound(port: int) -> socket.socket | None:
+    """Bind a UDP port, on all addresses and for this socket alone; None if somebody has it."""
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        made.bind(("", port))
+    except OSError:
+        made.close()
+        return None
+    return made
+
+
+def _unused(domain_id: int) -> bool:
+    """Say whether no participant of a domain runs here: each binds two ports of its own, or a shared one."""
+    ports = _ports_of(domain_id)
+    for port in (*ports[:2], *ports[10:]):
+        probe = _bound(port)
+        if probe is None:
+            return False
+        probe.close()
+    return True
+
+
+def new_graph_id() -> str:
+    """Return an identity for a graph: its nodes' messages carry it, and its nodes refuse another's."""
+    return uuid.uuid4().hex[:12]
 
 
 def free_shared_memory() -> int:
@@ -132,9 +206,10 @@ def remove_segment(segment: Path) -> None:
         owner.unlink(missing_ok=True)
 
 
-def graph_environment(domain_id: int, log_dir: Path) -> dict[str, str]:
+def graph_environment(domain_id: int, log_dir: Path, graph_id: str = "") -> dict[str, str]:
     """Return the environment of the graph's processes: this machine alone, shared memory, few threads."""
     own = {
+        GRAPH_ID: graph_id,
         "ROS_DOMAIN_ID": str(domain_id),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_LOG_DIR": str(log_dir),
@@ -359,7 +434,9 @@ class ForkServer:
             _orphans.leave()
 
 
-def start_fork_server(domain_id: int, log_dir: Path) -> contextlib.AbstractContextManager[ForkServer | None]:
+def start_fork_server(
+    domain_id: int, log_dir: Path, graph_id: str = ""
+) -> contextlib.AbstractContextManager[ForkServer | None]:
     """Start a fork server for a graph; None where the system has no such thing.
 
     Parameters
@@ -368,10 +445,12 @@ def start_fork_server(domain_id: int, log_dir: Path) -> contextlib.AbstractConte
         ROS domain of the graph.
     log_dir : Path
         Where logs go.
+    graph_id : str
+        The graph's identity (`new_graph_id`).
     """
     log_dir.mkdir(parents=True, exist_ok=True)
     try:
-        return ForkServer(graph_environment(domain_id, log_dir), log_dir / "fork_server.log")
+        return ForkServer(graph_environment(domain_id, log_dir, graph_id), log_dir / "fork_server.log")
     except ReplayError:
         return contextlib.nullcontext()
 
@@ -587,6 +666,8 @@ class Graph:
         How often each node may die and be started again.
     server : ForkServer, optional
         Starts the processes; by default each is an interpreter of its own from the beginning.
+    graph_id : str
+        The graph's identity (`new_graph_id`), as of the fork server; empty: none.
     """
 
     def __init__(
@@ -596,10 +677,12 @@ class Graph:
         log_dir: Path,
         max_restarts: int = 3,
         server: ForkServer | None = None,
+        graph_id: str = "",
     ) -> None:
         check(parameters)
         log_dir.mkdir(parents=True, exist_ok=True)
-        self.environment = graph_environment(domain_id, log_dir)
+        self.graph_id = graph_id
+        self.environment = graph_environment(domain_id, log_dir, graph_id)
         file = log_dir / "parameters.yaml"
         file.write_text(yaml_text(parameters, only_given=True), encoding="utf-8")
         self._server = server

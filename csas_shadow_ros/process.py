@@ -129,6 +129,7 @@ def replay_bag(
     *,
     start_from: str = "auto",
     rate: float = 0.0,
+    domain_id: int | None = None,
     run_of_bag: int | None = None,
     max_objects: int = MAX_OBJECTS,
     overwrite: bool = False,
@@ -148,6 +149,8 @@ def replay_bag(
         See `process_bag`.
     rate : float
         Views: times the recorded speed; 0: as fast as the nodes take them.
+    domain_id : int, optional
+        ROS domain, to look on with other tools; a free one otherwise.
 
     Returns
     -------
@@ -194,6 +197,7 @@ def replay_bag(
             p,
             stage=stage,
             rate=rate,
+            domain_id=domain_id,
             record=True,
             max_objects=max_objects,
             overrides={

@@ -20,10 +20,11 @@ from .core.errors import CsasError, NoTargetError, ParameterError
 from .core.parameters import MAX_OBJECTS, PipelineParameters
 from .graph import (
     MAX_DOMAIN_ID,
+    DomainReservation,
     Graph,
     ReplayError,
     environment_of,
-    free_domain_id,
+    new_graph_id,
     signals_deferred,
     start_fork_server,
 )
@@ -50,6 +51,8 @@ _CHAIN = {
     "shadow_mask": ("voxel_carver",),
 }
 _WITH_COMPOSITES = ("image", "sector", "sub_aperture")
+#: How often every node is heard (`nodes.base.BEAT_S`).
+BEAT_S = 0.5
 #: What is published already comes within a second, on a busy machine in some.
 _COLLECT_S = 60.0
 
@@ -204,6 +207,9 @@ class _Watcher:
         self.latest: dict[str, Any] = {}
         self._collected: set[str] = set()
         self._subscriptions: list[Any] = []
+        #: Who else's graph is at work here; empty if nobody's is.
+        self.rival = ""
+        self._graph = graph
         self._subscribe("progress", qos.REPORTS, self._on_progress, raw=True)
 
     def _subscribe(
@@ -218,6 +224,7 @@ class _Watcher:
         from rclpy.serialization import deserialize_message
 
         from msg_adapters import TOPICS, Heartbeat, is_routine_report, progress_from_msg
+        from msg_adapters.progress import graph_of
 
         if is_routine_report(cdr):
             return  # it changes nothing here, and a run has thousands
@@ -227,6 +234,12 @@ class _Watcher:
             )
         except CsasError:
             return  # an outside node's; the graph's own are well-formed
+        theirs = graph_of(item.instance)
+        if theirs != self._graph.graph_id and (theirs or item.node in self._graph.processes):
+            if isinstance(item, Heartbeat) and item.values.get("leaving") != "true":
+                whose = f"of another graph ({theirs})" if theirs else "that this replay did not start"
+                self.rival = f"{item.node} {whose}"
+            return
         if isinstance(item, Heartbeat):
             stream = item.values.get("stream", item.values.get("input", ""))
             if item.values.get("leaving") == "true":
@@ -259,8 +272,19 @@ class _Watcher:
                     return False
         return True
 
+    def alone(self) -> bool:
+        """Say whether nobody but the graph's own processes, as they are, can have said anything."""
+        # Each has two publishers, for reports and for heartbeats.
+        return bool(self._node.count_publishers("progress") <= 2 * len(self._graph.processes))
+
     def spin(self, seconds: float) -> None:
-        """Take what has come, then let so much time pass."""
+        """Take what has come, then let so much time pass.
+
+        Raises
+        ------
+        ReplayError
+            If another graph is at work in the same domain and namespace.
+        """
         # What a signal raises in the middle of a callback would leave the middleware half undone.
         with signals_deferred():
             for subscription in self._subscriptions:
@@ -268,6 +292,11 @@ class _Watcher:
                 with handle:
                     while (taken := handle.take_message(subscription.msg_type, subscription.raw)) is not None:
                         subscription.callback(taken[0])
+        if self.rival:
+            raise ReplayError(
+                f"{self.rival} is at work in ROS domain {self._context.get_domain_id()}, namespace"
+                f" {self._node.get_namespace()}, and no view says whose it is; expected a domain of its own"
+            )
         time.sleep(seconds)
 
     def collect(self, topics: Iterable[str]) -> None:
@@ -353,7 +382,7 @@ def replay(
     window : int
         Views that may be on their way at once.
     domain_id : int, optional
-        ROS domain, to look on with other tools; a free one otherwise.
+        ROS domain, to look on with other tools; a free one otherwise. No two replays share one.
     max_objects : int
         Bodies that are carved at most, the target among them; of shadow views and later stages one.
     overrides : mapping of node name to mapping, optional
@@ -394,9 +423,10 @@ def replay(
         of_stage = node_parameters(p, None if decision is None else decision.target, max_objects)
         plan = _node_plan(bag, chosen, of_stage, rate, recording, composites, window, overrides or {})
         check(plan)
-        domain = free_domain_id() if domain_id is None else domain_id
-        server = stack.enter_context(start_fork_server(domain, out / "log"))
-        graph = stack.enter_context(Graph(plan, domain, out / "log", max_restarts, server))
+        domain = stack.enter_context(DomainReservation(domain_id))
+        graph_id = new_graph_id()
+        server = stack.enter_context(start_fork_server(domain, out / "log", graph_id))
+        graph = stack.enter_context(Graph(plan, domain, out / "log", max_restarts, server, graph_id))
         with signals_deferred():
             watcher = _Watcher(graph, domain)
             stack.callback(watcher.close)
@@ -404,6 +434,10 @@ def replay(
         _until_complete(graph, watcher, chosen, done, tell, stall_timeout_s)
         through = time.monotonic()
         messages = _collect(graph, watcher, chosen, done, tell, stall_timeout_s)
+        if not watcher.alone():
+            # Some outside node, or a process that has died; or a graph that has not been heard yet.
+            watcher.spin(2.0 * BEAT_S)
+            watcher.spin(0.0)
         result = _result_of(messages, watcher, graph, chosen)
         result.seconds_after = time.monotonic() - through
         result.recording = recording

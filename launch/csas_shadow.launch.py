@@ -11,6 +11,7 @@ launch with one line that says which.
 """
 
 import sys
+import uuid
 from pathlib import Path
 
 from launch.actions import (
@@ -99,6 +100,8 @@ def live_graph():
     }
     recording = {"out": ParameterValue(out, value_type=str)}
     return [
+        # Who hears another graph in its namespace refuses it by this; a restarted node has the same.
+        SetEnvironmentVariable("CSAS_GRAPH_ID", uuid.uuid4().hex[:12]),
         *(node(name) for name in STAGES),
         node("composites", condition=IfCondition(LaunchConfiguration("composites"))),
         node("viewer", condition=IfCondition(LaunchConfiguration("viewer"))),

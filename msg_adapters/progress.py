@@ -17,6 +17,9 @@ INTEGRATED = "integrated"
 PUBLISHED = "published"
 REJECTED = "rejected"
 ROLES = ("source", "stage", "sink")
+#: Environment variable that names the graph a node belongs to, and what begins the instances of such nodes.
+GRAPH_ID = "CSAS_GRAPH_ID"
+_OF_GRAPH = "graph:"
 _NEWS = (HEARTBEAT.encode(), REJECTED.encode())
 
 
@@ -106,6 +109,28 @@ class Heartbeat:
     def __post_init__(self) -> None:
         if self.role not in ROLES:
             raise AdapterError(f"role is {self.role!r}; expected one of: {', '.join(ROLES)}")
+
+
+def instance_of(graph_id: str, process: str) -> str:
+    """Return the identity (``hardware_id``) of a process of a graph; without a graph it is the process' own.
+
+    Examples
+    --------
+    >>> instance_of("5eaf100d", "a1"), instance_of("", "a1")
+    ('graph:5eaf100d:a1', 'a1')
+    """
+    return f"{_OF_GRAPH}{graph_id}:{process}" if graph_id else process
+
+
+def graph_of(instance: str) -> str:
+    """Return the graph that a process' identity names; empty if none, as of an outside node's.
+
+    Examples
+    --------
+    >>> graph_of("graph:5eaf100d:a1-source"), graph_of("classifier-1")
+    ('5eaf100d', '')
+    """
+    return instance.split(":", 2)[1] if instance.startswith(_OF_GRAPH) else ""
 
 
 def progress_to_msg(factory: MessageFactory, item: ViewProgress | Heartbeat) -> Any:

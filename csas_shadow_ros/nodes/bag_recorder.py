@@ -118,6 +118,7 @@ class BagRecorderNode(CsasNode):
         self._all = p.topics == "all"
         for topic in topics_to_record(p.topics):
             self._record(topic)
+        self.follow_sources()  # and hear of other graphs
 
     # Bags
 

@@ -55,13 +55,14 @@ from msg_adapters import (
     view_info_from_msg,
     view_to_msgs,
 )
-from msg_adapters.progress import INTEGRATED, PUBLISHED, REJECTED
+from msg_adapters.progress import INTEGRATED, PUBLISHED, REJECTED, instance_of
 from msg_adapters.topics import stream as stream_of
 from msg_adapters.topics import topic as topic_of
 
 from . import qos
 from .flow import Flow
 from .params import NODES, declare, from_overrides
+from .rivals import Rivals
 
 NAMESPACE = "csas"
 BEAT_S = 0.5
@@ -102,6 +103,8 @@ class CsasNode(LifecycleNode):
     """
 
     name: ClassVar[str] = ""
+    #: There can be one such node in a namespace.
+    alone: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -132,6 +135,9 @@ class CsasNode(LifecycleNode):
         self.busy_s = 0.0
         #: What stops the node from working, if anything does; shown in diagnostics and heartbeats.
         self.error = ""
+        #: Who else's graph is at work here; as long as it is, nothing is taken and nothing sent.
+        self.rival = ""
+        self.rivals = Rivals(self.name, alone=self.alone)
         #: Stamp of the target that the node works for, "0" before there is one; empty: it needs none.
         self.target_stamp = ""
         self.inlets: list[Inlet] = []
@@ -177,6 +183,13 @@ class CsasNode(LifecycleNode):
         """Say what the node waits for; empty if for nothing."""
         return ""
 
+    def keeps_its_state(self) -> bool:
+        """Say whether what the node holds is its own graph's alone, now that another one has gone.
+
+        If not, it begins anew, as a node that was killed does: sources send it everything again.
+        """
+        return True
+
     def on_source(self, beat: Heartbeat) -> None:
         """Take a source's heartbeat; only nodes that `follow_sources` get them."""
 
@@ -194,7 +207,7 @@ class CsasNode(LifecycleNode):
         """Subscribe to a topic of the contract; nothing that the callback raises ends the node."""
 
         def guarded(msg: Any) -> None:
-            if self.active:
+            if self.active and (not self.rival or topic == "progress"):
                 self.guard(topic, callback, msg)
 
         kind = self.messages.cls(topic_of(topic).type_name)
@@ -253,8 +266,45 @@ class CsasNode(LifecycleNode):
         if is_routine_report(cdr):
             return  # most are, and to read one takes as long as to carve from a view
         item = progress_from_msg(deserialize_message(cdr, self.messages.cls(TOPICS["progress"].type_name)))
-        if isinstance(item, Heartbeat) and item.role == "source":
+        if self.is_ours(item) and isinstance(item, Heartbeat) and item.role == "source" and not self.rival:
             self.on_source(item)
+
+    # Other graphs
+
+    def is_ours(self, item: ViewProgress | Heartbeat) -> bool:
+        """Say whether a message on `progress` is not another graph's; note who is there."""
+        if isinstance(item, Heartbeat):
+            self.rivals.hear(item, self.instance)
+            if not self.rival:
+                self._look_for_rivals()
+        return not self.rivals.is_other(item.instance)
+
+    def _look_for_rivals(self) -> None:
+        who = self.rivals.look()
+        if who and not self.rival:
+            domain = self.context.get_domain_id()
+            self.rival = f"{who} is at work in {self.get_namespace()}, ROS domain {domain}"
+            self.get_logger().error(f"{self.rival}: nothing is taken or sent until it has ended")
+        elif not who and self.rival:
+            self.get_logger().warning(f"{self.rival.partition(' is at work')[0]} has gone: going on")
+            self.rival = ""
+            if not self.keeps_its_state():
+                self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        def again() -> None:
+            self.trigger_deactivate()
+            self.trigger_cleanup()
+            if not self.start():
+                self.get_logger().error(self.error or "could not begin anew")
+
+        if self.executor is not None:
+            self.executor.create_task(again)  # not within a timer that it takes away
+
+    @property
+    def trouble(self) -> str:
+        """What stops the node from working; empty if nothing does."""
+        return self.rival or self.error
 
     # Errors
 
@@ -364,8 +414,8 @@ class CsasNode(LifecycleNode):
         for source in self.sources:
             values |= {f"{source.stream} {k}": str(v) for k, v in source.counts().items()}
         waiting = self.waiting()
-        if self.error:
-            level, text = Level.ERROR, self.error
+        if self.trouble:
+            level, text = Level.ERROR, self.trouble
         elif waiting:
             level, text = Level.WARN, waiting
         elif self.counts["rejected"]:
@@ -382,7 +432,7 @@ class CsasNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Make everything; refuse with one line if that cannot be done."""
         # Whatever an earlier configuration reported is forgotten with its state.
-        self.instance = uuid.uuid4().hex[:12]
+        self.instance = instance_of(self.rivals.graph_id, uuid.uuid4().hex[:12])
         try:
             self._reports = self.publisher("progress", qos.REPORTS)
             self._heartbeats = self.publisher("progress", qos.HEARTBEAT)
@@ -400,7 +450,8 @@ class CsasNode(LifecycleNode):
 
     def _tick(self) -> None:
         self.start_waiting_work()
-        if self.active:
+        self._look_for_rivals()
+        if self.active and not self.rival:
             for inlet in self.inlets:
                 inlet.give_up_lonely()
             self.tick()
@@ -717,8 +768,8 @@ class Inlet:
         values = {"input": self.stream, **self._for_target(), **self.node.state_values(), **self._idle()}
         if leaving:
             values["leaving"] = "true"
-        if self.node.error:
-            values["error"] = self.node.error
+        if self.node.trouble:
+            values["error"] = self.node.trouble
         counts = self.node.common_counts()
         return Heartbeat(self.node.now_ns(), self.node.name, self.instance, self.role, counts, values)
 
@@ -776,12 +827,15 @@ class Source:
 
     def _on_progress(self, msg: Any) -> None:
         before = self.flow.in_flight
-        self.flow.heard(progress_from_msg(msg))
+        item = progress_from_msg(msg)
+        if not self.node.is_ours(item):
+            return
+        self.flow.heard(item)
         if self.flow.in_flight < before:
             self.wake()
 
     def _pump(self) -> None:
-        if not self.node.active:
+        if not self.node.active or self.node.rival:
             return
         flow, now = self.flow, time.monotonic()
         if now - self._looked_s > 0.1:
@@ -859,8 +913,8 @@ class Source:
             values |= self.node.state_values()
             if self.flow.target:
                 values["target"] = self.flow.target
-        if self.node.error:
-            values["error"] = self.node.error
+        if self.node.trouble:
+            values["error"] = self.node.trouble
         counts = self.node.common_counts() | self.counts()
         return Heartbeat(self.node.now_ns(), self.node.name, self.instance, "source", counts, values)
 

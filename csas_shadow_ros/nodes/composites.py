@@ -27,6 +27,7 @@ class CompositesNode(CsasNode):
     """Takes `sub_aperture/*`; publishes `multilook/*` and `color_by_aspect/*`."""
 
     name = "composites"
+    alone = True
 
     def setup(self) -> None:
         """Make publishers, then the inlet."""
@@ -53,6 +54,10 @@ class CompositesNode(CsasNode):
         self.run_ns: int | None = None
         self.composites: Composites | None = None
         self.acoustics: Acoustics | None = None
+
+    def keeps_its_state(self) -> bool:
+        """Say no: views of another graph may be in the images."""
+        return False
 
     def state_counts(self) -> dict[str, int]:
         """Return how many views are in, and whether that is all."""

@@ -89,6 +89,7 @@ class SubApertureNode(CsasNode):
     """Takes `image` or `sector/*`, and `track`; publishes `search`, `target` and `sub_aperture/*`."""
 
     name = "sub_aperture"
+    alone = True
 
     def setup(self) -> None:
         """Make outlets, then inlets."""
@@ -121,6 +122,10 @@ class SubApertureNode(CsasNode):
         self.unplaced: list[tuple[float, Any, Any]] = []
         self.sub_apertures: SubApertures | None = None
         self.aspects: dict[int, float] = {}
+
+    def keeps_its_state(self) -> bool:
+        """Say yes once a run has begun; before, its image may have come while nothing was taken."""
+        return bool(self.runs or self.over)
 
     @property
     def run(self) -> Run | None:

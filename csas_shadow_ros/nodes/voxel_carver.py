@@ -45,6 +45,7 @@ class VoxelCarverNode(CsasNode):
     """
 
     name = "voxel_carver"
+    alone = True
 
     def setup(self) -> None:
         """Make publishers, then the inlets of the method's streams."""
@@ -201,6 +202,10 @@ class VoxelCarverNode(CsasNode):
             self.growing.changed()
         return INTEGRATED
 
+    def keeps_its_state(self) -> bool:
+        """Say no: views of another graph may be in the grid."""
+        return False
+
     def on_source(self, beat: Heartbeat) -> None:
         """Finish once a source says that every view is here."""
         own = beat.values.get("target", self.target.stamp) == self.target.stamp
@@ -213,7 +218,7 @@ class VoxelCarverNode(CsasNode):
 
     def show(self) -> None:
         """Publish what has changed."""
-        if not self.active:
+        if not self.active or self.rival:
             return
         made = self.reconstruction
         if self.further is not None and made is not None and all(b.given_up for b in made.bodies[1:]):

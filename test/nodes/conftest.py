@@ -26,6 +26,15 @@ def graph() -> Iterator[Graph]:
     made.close()
 
 
+@pytest.fixture
+def domain() -> Iterator[int]:
+    """A ROS domain that is the test's own."""
+    from csas_shadow_ros.graph import DomainReservation
+
+    with DomainReservation() as domain_id:
+        yield domain_id
+
+
 @pytest.fixture(scope="session")
 def simulated() -> SimulatedRun:
     return simulate("tiny", "box", seed=1)

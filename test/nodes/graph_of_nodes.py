@@ -17,7 +17,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
-from csas_shadow_ros.graph import free_domain_id
+from csas_shadow_ros.graph import DomainReservation
 from csas_shadow_ros.nodes.base import CsasNode
 
 #: 36 views and few voxels: the same code as for a large run, in a second.
@@ -31,7 +31,8 @@ class Graph:
     """Nodes that share one executor; what a test spins."""
 
     def __init__(self) -> None:
-        self.domain_id = free_domain_id()
+        self._domain = DomainReservation()
+        self.domain_id = self._domain.domain_id
         self.context = Context()
         rclpy.init(context=self.context, domain_id=self.domain_id)
         self.executor = SingleThreadedExecutor(context=self.context)
@@ -89,3 +90,4 @@ class Graph:
             node.destroy_node()
         self.executor.shutdown(timeout_sec=1.0)
         rclpy.shutdown(context=self.context)
+        self._domain.close()

@@ -31,7 +31,6 @@ from csas_shadow_ros.graph import (
     Graph,
     GraphProcess,
     ReplayError,
-    free_domain_id,
     graph_environment,
     segments_of,
     start_fork_server,
@@ -223,18 +222,18 @@ def run_node(name: str, *arguments: str, log_dir: Path, domain: int) -> subproce
     ],
 )
 def test_a_node_ends_with_status_2_and_one_clear_line_where_a_parameter_is_wrong(
-    tmp_path: Path, argument: str, message: str
+    domain: int, tmp_path: Path, argument: str, message: str
 ) -> None:
-    process = run_node("voxel_carver", "-p", argument, log_dir=tmp_path, domain=free_domain_id())
+    process = run_node("voxel_carver", "-p", argument, log_dir=tmp_path, domain=domain)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 2
     assert stderr.strip().splitlines()[-1].startswith(message)
     assert "Traceback" not in stderr
 
 
-def test_a_recorder_that_is_interrupted_finishes_its_bag(tmp_path: Path) -> None:
+def test_a_recorder_that_is_interrupted_finishes_its_bag(domain: int, tmp_path: Path) -> None:
     out = tmp_path / "recording"
-    process = run_node("bag_recorder", "-p", f"out:={out}", log_dir=tmp_path, domain=free_domain_id())
+    process = run_node("bag_recorder", "-p", f"out:={out}", log_dir=tmp_path, domain=domain)
     deadline = time.monotonic() + 60
     while not list(out.glob("*.mcap")):
         assert time.monotonic() < deadline
@@ -271,10 +270,10 @@ def test_a_recorder_that_is_ended_in_mid_run_goes_on_with_its_bag(
 
 
 def test_a_recording_that_is_there_is_refused_unless_it_is_to_be_gone_on_with(
-    run_bag: Path, tmp_path: Path
+    domain: int, run_bag: Path, tmp_path: Path
 ) -> None:
     recording = ("-p", f"out:={run_bag}")
-    process = run_node("bag_recorder", *recording, log_dir=tmp_path, domain=free_domain_id())
+    process = run_node("bag_recorder", *recording, log_dir=tmp_path, domain=domain)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 2
     assert "exists" in stderr
@@ -295,8 +294,8 @@ def test_a_results_folder_that_is_a_file_is_refused_by_name(run_bag: Path, tmp_p
 def test_nodes_end_when_the_process_that_started_them_was_killed(tmp_path: Path, forked: bool) -> None:
     code = (
         "import sys, time; from pathlib import Path\n"
-        "from csas_shadow_ros.graph import Graph, free_domain_id, start_fork_server\n"
-        f"d, log = free_domain_id(), Path({str(tmp_path)!r})\n"
+        "from csas_shadow_ros.graph import DomainReservation, Graph, start_fork_server\n"
+        f"held = DomainReservation(); d, log = held.domain_id, Path({str(tmp_path)!r})\n"
         f"server = start_fork_server(d, log).__enter__() if {forked} else None\n"
         "g = Graph({'composites': {}}, d, log, server=server)\n"
         "g.__enter__(); print(g.processes['composites'].pid, server and server.pid, flush=True)\n"
@@ -338,8 +337,8 @@ def segments() -> set[str]:
 
 
 @pytest.mark.parametrize("forked", [False, True])
-def test_processes_that_end_leave_no_shared_memory(tmp_path: Path, forked: bool) -> None:
-    domain, before = free_domain_id(), segments()
+def test_processes_that_end_leave_no_shared_memory(domain: int, tmp_path: Path, forked: bool) -> None:
+    before = segments()
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(start_fork_server(domain, tmp_path)) if forked else None
         nodes: dict[str, dict[str, Any]] = {"composites": {}, "shadow_likelihood": {}}
@@ -351,8 +350,10 @@ def test_processes_that_end_leave_no_shared_memory(tmp_path: Path, forked: bool)
 
 
 @pytest.mark.parametrize("forked", [False, True])
-def test_the_shared_memory_of_a_killed_node_is_taken_away_and_no_other(tmp_path: Path, forked: bool) -> None:
-    domain, before = free_domain_id(), segments()
+def test_the_shared_memory_of_a_killed_node_is_taken_away_and_no_other(
+    domain: int, tmp_path: Path, forked: bool
+) -> None:
+    before = segments()
 
     def owned(pid: int) -> set[str]:
         return {path.name for path in segments_of(pid)}
@@ -384,8 +385,9 @@ def test_the_shared_memory_of_a_killed_node_is_taken_away_and_no_other(tmp_path:
     assert not {name for name in segments() - before if "_port" not in name}
 
 
-def test_nodes_outlive_the_process_that_forked_them_and_are_started_again_without_it(tmp_path: Path) -> None:
-    domain = free_domain_id()
+def test_nodes_outlive_the_process_that_forked_them_and_are_started_again_without_it(
+    domain: int, tmp_path: Path
+) -> None:
     with start_fork_server(domain, tmp_path) as server:
         assert server is not None
         with Graph({"composites": {}, "shadow_likelihood": {}}, domain, tmp_path, server=server) as graph:
@@ -408,8 +410,7 @@ def test_nodes_outlive_the_process_that_forked_them_and_are_started_again_withou
     assert not [pid for pid in pids.values() if alive(pid)]
 
 
-def test_a_graph_that_is_left_before_its_nodes_are_there_leaves_none(tmp_path: Path) -> None:
-    domain = free_domain_id()
+def test_a_graph_that_is_left_before_its_nodes_are_there_leaves_none(domain: int, tmp_path: Path) -> None:
     nodes = ("bag_player", "sub_aperture", "shadow_enhancement", "shadow_likelihood", "voxel_carver")
     with start_fork_server(domain, tmp_path) as server:
         assert server is not None
@@ -424,8 +425,7 @@ def test_a_graph_that_is_left_before_its_nodes_are_there_leaves_none(tmp_path: P
         assert not left
 
 
-def test_a_fork_server_that_does_not_answer_holds_nobody_up(tmp_path: Path) -> None:
-    domain = free_domain_id()
+def test_a_fork_server_that_does_not_answer_holds_nobody_up(domain: int, tmp_path: Path) -> None:
     with start_fork_server(domain, tmp_path) as server:
         assert server is not None
         os.kill(server.pid, signal.SIGSTOP)
@@ -437,10 +437,9 @@ def test_a_fork_server_that_does_not_answer_holds_nobody_up(tmp_path: Path) -> N
 
 
 def test_a_node_is_started_without_a_fork_server_that_takes_too_long(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(graph_module, "_PATIENCE_S", 0.5)
-    domain = free_domain_id()
     with start_fork_server(domain, tmp_path) as server:
         assert server is not None
         os.kill(server.pid, signal.SIGSTOP)
@@ -450,9 +449,8 @@ def test_a_node_is_started_without_a_fork_server_that_takes_too_long(
 
 
 def test_an_interrupt_while_processes_are_ended_leaves_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    domain = free_domain_id()
     pids: list[int] = []
     waited = GraphProcess.wait
     calls: list[str] = []
@@ -538,8 +536,8 @@ def test_a_little_shared_memory_is_left_to_the_middleware(
     assert "FASTRTPS_DEFAULT_PROFILES_FILE" not in graph_environment(1, tmp_path)
 
 
-def test_a_node_that_dies_again_and_again_ends_the_replay_by_name(tmp_path: Path) -> None:
-    graph = Graph({"composites": {}}, free_domain_id(), tmp_path, max_restarts=1)
+def test_a_node_that_dies_again_and_again_ends_the_replay_by_name(domain: int, tmp_path: Path) -> None:
+    graph = Graph({"composites": {}}, domain, tmp_path, max_restarts=1)
     with graph:
         process = graph.processes["composites"]
         for _ in range(2):

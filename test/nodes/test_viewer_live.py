@@ -23,7 +23,7 @@ pytest.importorskip("aiohttp")
 from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M
 
 from csas_shadow_ros.core.pipeline import ProcessedView, Result
-from csas_shadow_ros.graph import Graph, free_domain_id, graph_environment
+from csas_shadow_ros.graph import Graph, graph_environment
 from csas_shadow_ros.replay import replay
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "viewer"))
@@ -105,8 +105,8 @@ class Viewer:
 
 
 @pytest.fixture
-def viewer(tmp_path: Path) -> Iterator[Viewer]:
-    made = Viewer(free_domain_id(), tmp_path)
+def viewer(domain: int, tmp_path: Path) -> Iterator[Viewer]:
+    made = Viewer(domain, tmp_path)
     yield made
     made.kill()
 
