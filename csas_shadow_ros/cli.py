@@ -819,6 +819,10 @@ def _replay(arguments: argparse.Namespace, console: Console) -> int:
                 notice=console.notice,
             )
         code = max(code, _give_report(console, out, report))
+        if lacking := report.get("not_recorded"):
+            told = "; ".join(lacking)
+            print(f"{PROGRAM}: error: the recording is not whole: {told}", file=sys.stderr)
+            code = max(code, FAILED)
     return code
 
 
@@ -844,6 +848,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         # The reader of our output has gone, as `head` does.
         sys.stderr.close()
+        return FAILED
+    except OSError as error:
+        # A full disk, a folder that is read-only, a quota: nothing that a traceback would explain.
+        if arguments.debug:
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"{PROGRAM}: error: {where}{error.strerror or error}", file=sys.stderr)
         return FAILED
     except KeyboardInterrupt:
         print(f"{PROGRAM}: error: interrupted", file=sys.stderr)

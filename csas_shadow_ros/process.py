@@ -155,7 +155,8 @@ def replay_bag(
     Returns
     -------
     dict
-        The report. The nodes' logs are in the folder's ``log/``.
+        The report, and as ``not_recorded`` what of the run its bag lacks. The nodes' logs are in the
+        folder's ``log/``.
 
     Raises
     ------
@@ -218,8 +219,10 @@ def replay_bag(
         writer.attempt("log", lambda: (scratch / "log").rename(writer.work / "log"), None)
         shutil.rmtree(scratch, ignore_errors=True)
         context.problems = [*told_once(run.problems), *unplaced(replayed)]
+        context.problems += [f"the recording is not whole: {line}" for line in replayed.not_recorded]
         context.describe(lambda: describe_run(run))
-        return writer.finish(result, context)
+        report = writer.finish(result, context)
+        return report | {"not_recorded": replayed.not_recorded} if write_bag else report
 
 
 def choose_start(run: Run, start_from: str = "auto") -> str:

@@ -50,6 +50,13 @@ _CHAIN = {
     "likelihood": ("voxel_carver",),
     "shadow_mask": ("voxel_carver",),
 }
+#: Who may have refused a view before it is in a stream.
+_STAGES_BEFORE: dict[str, tuple[str, ...]] = {
+    "sub_aperture": (),
+    "shadow": ("shadow_enhancement",),
+    "likelihood": ("shadow_enhancement", "shadow_likelihood"),
+    "shadow_mask": ("shadow_enhancement", "shadow_likelihood"),
+}
 _WITH_COMPOSITES = ("image", "sector", "sub_aperture")
 #: How often every node is heard (`nodes.base.BEAT_S`).
 BEAT_S = 0.5
@@ -124,6 +131,8 @@ class ReplayResult:
         Each node's part, by name.
     recording : Path or None
         The bag that was recorded.
+    not_recorded : list of str
+        What was published and is not in it, and why; expected to be empty.
     seconds : float
         Wall time, from the first process to the result.
     seconds_after : float
@@ -140,6 +149,7 @@ class ReplayResult:
     lost: int = 0
     nodes: dict[str, NodeReport] = field(default_factory=dict)
     recording: Path | None = None
+    not_recorded: list[str] = field(default_factory=list)
     seconds: float = 0.0
     seconds_after: float = 0.0
 
@@ -258,6 +268,17 @@ class _Watcher:
         for key in [key for key in self.beats if key[0] == node]:
             self._dead.add(self.beats.pop(key).instance)
 
+    def unable(self, node: str) -> str:
+        """Say why a node cannot do its work; empty if it can."""
+        told = [b.values.get("unable", "") for (name, _), b in self.beats.items() if name == node]
+        return max(told, default="")
+
+    def published(self, streams: Iterable[str]) -> list[str]:
+        """Return those of the streams that somebody publishes."""
+        from msg_adapters.topics import stream as stream_of
+
+        return [s for s in streams if self._node.count_publishers(stream_of(s).image_topic)]
+
     def recorded(self, streams: Iterable[str]) -> bool:
         """Say whether the running recorder has every view of those of the streams that somebody publishes."""
         from msg_adapters.topics import stream as stream_of
@@ -265,6 +286,8 @@ class _Watcher:
         finished: set[str] = set()
         for beat in self.beats.values():
             finished.update(beat.values.get("finished_for", "").split())
+        if self.unable("bag_recorder"):
+            return True
         for stream in streams:
             if self._node.count_publishers(stream_of(stream).image_topic):
                 beat = self.beats.get(("bag_recorder", stream))
@@ -442,6 +465,13 @@ def replay(
         result.seconds_after = time.monotonic() - through
         result.recording = recording
         result.seconds = time.monotonic() - began
+        if recording is not None:
+            published = watcher.published(_STAGES_BEFORE)
+            unable = watcher.unable("bag_recorder")
+            graph.stop()  # its bag is finished now
+            result.not_recorded = [unable] if unable else []
+            topics = graph.parameters["bag_recorder"].get("topics", "all")
+            result.not_recorded += _not_recorded(recording, topics, result, published, set(messages))
     return result
 
 
@@ -560,7 +590,9 @@ def _until_complete(
             return
         names = ("in", "sent", "done", "views")
         changes = {k: (b.instance, *map(b.counts.get, names)) for k, b in watcher.beats.items()}
-        if changes != state:
+        # At a rate the next view's time may be far off: the player says so.
+        paced = any(b.values.get("due_in_s") for b in watcher.beats.values())
+        if changes != state or paced:
             state, since = changes, time.monotonic()
         elif time.monotonic() - since > stall_timeout_s:
             lines = [f"{name}: {process.last_line()}" for name, process in graph.processes.items()]
@@ -620,7 +652,7 @@ def _collect(
                 continue
             beats = [b for (node, _), b in watcher.beats.items() if node == "bag_recorder"]
             held = max((b.counts.get("result_topics", 0) for b in beats), default=len(further))
-            if held >= len(further):
+            if held >= len(further) or watcher.unable("bag_recorder"):
                 return got
             if time.monotonic() - since > _COLLECT_S:
                 tell(f"the recording holds {held} of the {len(further)} topics of the result")
@@ -639,6 +671,40 @@ def _collect(
 def _views_in(watcher: _Watcher, node: str) -> int:
     told = [b.counts.get("views", 0) for (name, _), b in watcher.beats.items() if name == node]
     return max(told, default=0)
+
+
+def _not_recorded(
+    recording: Path, topics: str, result: ReplayResult, published: Iterable[str], messages: set[str]
+) -> list[str]:
+    """Hold a recording against what was published; one line for each topic or stream that is not whole."""
+    from .bags import BagReader
+    from .nodes.playing import recorded_streams, topics_to_record
+
+    try:
+        reader = BagReader(recording)
+    except CsasError as error:
+        return [str(error)]
+
+    def count(topic: str) -> int:
+        found = reader.topic(topic)
+        return found.count if found is not None else 0
+
+    expected = {"image": {"image", "camera_info", "track"}, "sector": {"track"}}.get(result.stage, set())
+    named = None if topics == "all" else set(topics_to_record(topics))
+    once = sorted(t for t in expected | messages if named is None or t in named)
+    lacking = [topic for topic in once if not count(topic)]
+    lines = [f"nothing of {', '.join(lacking)}"] if lacking else []
+    kept = recorded_streams(topics)
+    for name in published:
+        if name not in kept:
+            continue
+        stages = _STAGES_BEFORE[name]
+        refused = {view.stamp_ns for view in result.rejected if view.node in stages}
+        wanted = result.views_total - len(refused)
+        held = min(count(f"{name}/image"), count(f"{name}/camera_info"))
+        if held < wanted:
+            lines.append(f"{held} of {wanted} {name} views")
+    return lines
 
 
 def _result_of(got: Mapping[str, Any], watcher: _Watcher, graph: Graph, stage: str) -> ReplayResult:

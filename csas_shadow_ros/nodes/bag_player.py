@@ -14,7 +14,7 @@ from msg_adapters import coherent_image_from_msgs, track_to_msg
 
 from . import qos
 from .base import CsasNode, Source, run_node
-from .playing import BagViews, stage_of_bag
+from .playing import BagViews, schedule, stage_of_bag
 
 
 class BagPlayerNode(CsasNode):
@@ -28,7 +28,9 @@ class BagPlayerNode(CsasNode):
             raise ParameterError("bag is ''; expected the path of a bag")
         self.reader = BagReader(self.parameters.bag)
         self.views: BagViews | None = None
-        self._began: tuple[float, int] | None = None
+        self._began: tuple[float, float] | None = None
+        #: When the next view is to be sent at the chosen rate, on the monotonic clock.
+        self._due_s = 0.0
         stage = stage_of_bag(self.reader, self.parameters.stage)
         self.runs = BagRuns(self.reader, self._problem, self.parameters.run or None)
         self.get_logger().info(f"plays {stage} of {self.parameters.bag}")
@@ -36,6 +38,9 @@ class BagPlayerNode(CsasNode):
             self.latch_image()
         else:
             self.views = BagViews(self.reader, stage, self.runs.covers)
+            self._schedule, notes = schedule(self.views.times)
+            for note in notes if self.parameters.rate > 0 else ():
+                self.get_logger().warning(note)
             self.source = Source(self, stage, self.send_view, self.may_send)
             self.source.flow.offer(self.views.times)
             self.latch("target")
@@ -94,7 +99,13 @@ class BagPlayerNode(CsasNode):
         if self._began is None:
             return True
         since, first = self._began
-        return (self.views.times[stamp] - first) / 1e9 <= (time.monotonic() - since) * rate
+        self._due_s = since + (self._schedule[stamp] - first) / rate
+        return time.monotonic() >= self._due_s
+
+    def state_values(self) -> dict[str, str]:
+        """Return for how long nothing happens because the next view's time has not come."""
+        wait_s = self._due_s - time.monotonic()
+        return {"due_in_s": f"{wait_s:.1f}"} if wait_s > 0 and not self.source.flow.in_flight else {}
 
     def send_view(self, stamp: int) -> None:
         """Publish a view as it was recorded."""
@@ -102,7 +113,7 @@ class BagPlayerNode(CsasNode):
             raise BagError(f"view {stamp} ns was asked for, but the bag's image is played")
         image, info = self.views.get(stamp)
         if self._began is None:
-            self._began = (time.monotonic(), self.views.times[stamp])
+            self._began = (time.monotonic(), self._schedule[stamp])
         self.source.info.publish(info)
         self.source.image.publish(image)
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import fcntl
+import shutil
 import sys
 import time
 import zlib
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
@@ -34,11 +36,18 @@ _MOST_RUNS = 10_000
 _BEGIN_A_RUN = frozenset({"image", "camera_info", "sector/image", "sector/camera_info"})
 _MOST_UNPLACED = 16
 _FLUSH_S = 1.0
+#: So much of the disk is left free: an index of 10 000 views, some MB, is needed to finish a bag, and others
+#: that share the disk (logs, results) can still say what is wrong.
+_RESERVE = 16 << 20
 
 
 def _bag_of_run(out: Path, number: int) -> Path:
     """Return the bag of the second, third, … run."""
     return out.with_name(f"{out.name}_{number}")
+
+
+def _latched_profile(topic: str) -> Any:
+    return qos.TRACK if topic == "track" else qos.LATCHED
 
 
 class RecordingInlet(Inlet):
@@ -112,6 +121,11 @@ class BagRecorderNode(CsasNode):
         #: Images and sectors whose stamp no track covers yet: (since, topic, message).
         self._unplaced: list[tuple[float, str, bytes]] = []
         self._flushed_s = 0.0
+        #: Topics of which something was not taken for want of space, and the latched topics' subscriptions.
+        self._dropped: set[str] = set()
+        self._latched: dict[str, Any] = {}
+        self._largest = 0
+        self._broken = False
         self._open(Path(p.out))
         self.inlets.extend(dict.fromkeys(inlet for inlet, _ in self._flows.values()))
         self._recorded: set[str] = set()
@@ -180,9 +194,13 @@ class BagRecorderNode(CsasNode):
         self._bags.remove(bag)
         if bag.run_ns is not None:
             self._over.add(bag.run_ns)
-        bag.writer.close()
-        if self.parameters.sync:
-            sync_tree(bag.path)
+        try:
+            bag.writer.close()
+            if self.parameters.sync:
+                sync_tree(bag.path)
+        except (BagError, OSError) as error:
+            self.unable = self.unable or str(error)
+            self.get_logger().error(f"{error}; what was written up to there can be read")
 
     # Which bag
 
@@ -210,6 +228,11 @@ class BagRecorderNode(CsasNode):
         """Write a message into the bag of the run that its stamp is of."""
         when = time.time_ns()
         if not self._bags:
+            return
+        self._largest = max(self._largest, len(cdr))
+        if self.unable or not self._has_room(len(cdr)):
+            self.counts["dropped"] += 1
+            self._dropped.add(topic)
             return
         newest = self._bags[-1]
         if topic == "track":
@@ -244,6 +267,41 @@ class BagRecorderNode(CsasNode):
             for older in self._bags[: self._bags.index(bag)]:
                 self._close_bag(older)
 
+    # Room
+
+    def _has_room(self, size: int) -> bool:
+        """Say whether the disk has room; a bag that is always left some can be finished, and gone on with."""
+        path = self._bags[-1].path
+        try:
+            free = shutil.disk_usage(path).free
+        except OSError as error:
+            self.cannot(f"cannot write to {path}: {error.strerror}")
+            return False
+        needed = size + _RESERVE
+        if free < needed:
+            self.cannot(f"the disk of {path} has {free / 1e6:.1f} MB left; expected {needed / 1e6:.1f} MB")
+        return free >= needed
+
+    def _look_for_room(self) -> None:
+        """Go on once there is room again, by a margin."""
+        if self._broken or not self._bags:
+            return
+        if shutil.disk_usage(self._bags[-1].path).free > 2 * _RESERVE + self._largest:
+            self.cannot("")
+            for topic in self._dropped & set(self._latched):
+                # Views are sent again; of these whoever subscribes anew gets the last.
+                self.unsubscribe(self._latched[topic])
+                profile = _latched_profile(topic)
+                self._latched[topic] = self.subscribe(topic, profile, self._taker(topic), raw=True)
+            self._dropped.clear()
+
+    def _failed(self, error: BagError) -> None:
+        """Write no more after the disk has refused: what a bag holds behind that cannot be read."""
+        if not isinstance(error.__cause__, OSError):
+            raise error
+        self._broken = True
+        self.cannot(str(error))
+
     def _begin_run(self, run_ns: int) -> RunBag:
         """Open the bag of another run; that of the run before stays open until the new one has results."""
         out = Path(self.parameters.out)
@@ -261,15 +319,16 @@ class BagRecorderNode(CsasNode):
         if topic in self._recorded:
             return
         self._recorded.add(topic)
-
-        def take(cdr: Any) -> None:
-            self._take(topic, cdr)
-
+        take = self._taker(topic)
         if is_latched(topic):
-            profile = qos.TRACK if topic == "track" else qos.LATCHED
-            self.subscribe_latched(topic, take, raw=True, profile=profile)
+            self._latched[topic] = self.subscribe_latched(
+                topic, take, raw=True, profile=_latched_profile(topic)
+            )
         else:
             self.subscribe(topic, qos.UNLATCHED if topic in _NEVER_ALIKE else qos.VIEWS, take, raw=True)
+
+    def _taker(self, topic: str) -> Callable[[bytes], None]:
+        return lambda cdr: self._take(topic, cdr)
 
     def _write(self, bag: RunBag, topic: str, cdr: bytes, when: int, *, report: bool = True) -> None:
         stamp = message_stamp(cdr, topic)
@@ -284,7 +343,11 @@ class BagRecorderNode(CsasNode):
             bag.writer.add_topic(
                 name, topic_of(topic).type_name, depth=1 if latched else 100, latched=latched
             )
-            bag.writer.write(name, cdr, when)
+            try:
+                bag.writer.write(name, cdr, when)
+            except BagError as error:
+                self._failed(error)
+                return
             self.counts["written"] += 1
             if split_prefix(topic)[1] in RESULT_TOPICS:
                 bag.results.add(topic)
@@ -296,7 +359,11 @@ class BagRecorderNode(CsasNode):
                 self.counts["in"] += not is_info
                 if stamp in inlet.stamps[not is_info]:
                     # On disk before it is said to be: nobody sends again what a killed recorder reported.
-                    bag.writer.flush()
+                    try:
+                        bag.writer.flush()
+                    except BagError as error:
+                        self._failed(error)
+                        return
                 inlet.wrote(stamp, is_info=is_info)
             else:
                 inlet.stamps[is_info].add(stamp)
@@ -326,8 +393,13 @@ class BagRecorderNode(CsasNode):
         """See to it that a crash costs little; record further objects' topics as they appear."""
         if self._bags and time.monotonic() - self._flushed_s > _FLUSH_S:
             self._flushed_s = time.monotonic()
-            for bag in self._bags:
-                bag.writer.flush()
+            if self.unable:
+                self._look_for_room()
+            try:
+                for bag in self._bags if not self.unable else ():
+                    bag.writer.flush()
+            except BagError as error:
+                self._failed(error)
         self._place_again()
         if self._bags and self._all:
             prefix = f"{absolute_name('', self.get_namespace()).rstrip('/')}/"

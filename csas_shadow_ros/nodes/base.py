@@ -135,6 +135,8 @@ class CsasNode(LifecycleNode):
         self.busy_s = 0.0
         #: What stops the node from working, if anything does; shown in diagnostics and heartbeats.
         self.error = ""
+        #: Why the node cannot take anything for now, if it cannot: the others go on without it after a while.
+        self.unable = ""
         #: Who else's graph is at work here; as long as it is, nothing is taken and nothing sent.
         self.rival = ""
         self.rivals = Rivals(self.name, alone=self.alone)
@@ -227,15 +229,16 @@ class CsasNode(LifecycleNode):
         *,
         raw: bool = False,
         profile: Any = qos.LATCHED,
-    ) -> None:
+    ) -> Subscription:
         """Subscribe to a latched topic, whether or not its publisher really latches it."""
-        self.subscribe(topic, profile, callback, raw=raw)
+        made = self.subscribe(topic, profile, callback, raw=raw)
         if not self._unlatched:
             # One timer for all topics: a recorder follows dozens.
             self.every(_DURABILITY_S, self._look_for_unlatched)
         self._unlatched.append(
             Unlatched(self, topic, lambda: self.subscribe(topic, qos.UNLATCHED, callback, raw=raw))
         )
+        return made
 
     def _look_for_unlatched(self) -> None:
         for one in self._unlatched:
@@ -305,6 +308,16 @@ class CsasNode(LifecycleNode):
     def trouble(self) -> str:
         """What stops the node from working; empty if nothing does."""
         return self.rival or self.error
+
+    def cannot(self, why: str) -> None:
+        """Say, at once and in every heartbeat, that the node can take nothing, or again can (empty)."""
+        before, self.unable = self.unable, why
+        if why and not before:
+            self.get_logger().error(f"{why}: nothing is taken")
+        elif before and not why:
+            self.get_logger().warning("goes on")
+        if bool(why) != bool(before):
+            self.tell_now()
 
     # Errors
 
@@ -414,8 +427,8 @@ class CsasNode(LifecycleNode):
         for source in self.sources:
             values |= {f"{source.stream} {k}": str(v) for k, v in source.counts().items()}
         waiting = self.waiting()
-        if self.trouble:
-            level, text = Level.ERROR, self.trouble
+        if self.trouble or self.unable:
+            level, text = Level.ERROR, self.trouble or self.unable
         elif waiting:
             level, text = Level.WARN, waiting
         elif self.counts["rejected"]:
@@ -437,7 +450,7 @@ class CsasNode(LifecycleNode):
             self._reports = self.publisher("progress", qos.REPORTS)
             self._heartbeats = self.publisher("progress", qos.HEARTBEAT)
             self._diagnostics = self.publisher("/diagnostics", qos.DIAGNOSTICS)
-            self.error = ""
+            self.error = self.unable = ""
             self.setup()
             self.every(1.0, self._publish_diagnostics)
             self.every(0.2, self._tick)
@@ -770,6 +783,8 @@ class Inlet:
             values["leaving"] = "true"
         if self.node.trouble:
             values["error"] = self.node.trouble
+        if self.node.unable:
+            values["unable"] = self.node.unable
         counts = self.node.common_counts()
         return Heartbeat(self.node.now_ns(), self.node.name, self.instance, self.role, counts, values)
 

@@ -57,6 +57,8 @@ class Peer:
     alive: bool = True
     #: The target that it works for; empty if it needs none.
     target: str = ""
+    #: It says that it cannot do its work, and why; it is waited for as one that has gone.
+    unable: str = ""
     #: It has said goodbye: a report that was overtaken by that does not bring it back, a heartbeat does.
     left: bool = False
 
@@ -189,7 +191,9 @@ class Flow:
         # A recorder of a stream that nobody publishes, as far as it knows: nothing for it to report.
         idle = item.values.get("idle") == "true"
         peer = self.peers.setdefault(item.instance, Peer(item.instance, item.node, role, stream, now, False))
-        there = not leaving and not idle
+        if isinstance(item, Heartbeat):
+            self._is_unable(peer, item.values.get("unable", ""))
+        there = not leaving and not idle and not peer.unable
         peer.left = leaving or (peer.left and isinstance(item, ViewProgress))
         if isinstance(item, ViewProgress) and (idle or peer.left):
             there = peer.alive and not peer.left  # a report tells what was done, not how it stands now
@@ -207,6 +211,14 @@ class Flow:
             self._choose_leaves()
         if isinstance(item, ViewProgress) and self._counts(peer):
             self._reported(peer, item)
+
+    def _is_unable(self, peer: Peer, why: str) -> None:
+        """Wait, for a while, for a sink that says that it cannot work."""
+        if why and not peer.unable and peer.role == "sink":
+            self._gone[peer.node, peer.stream] = self.clock()
+            wait = f"it is waited for, {self.sink_wait_s:g} s at most"
+            self.notes.append(("warn", f"{peer.node} cannot take {peer.stream}: {why}; {wait}"))
+        peer.unable = why
 
     def _counts(self, peer: Peer) -> bool:
         return not (self.target and peer.target) or peer.target == self.target

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
+from statistics import median
 from typing import Any
 
 from csas_shadow_ros.bags import BagReader
@@ -22,6 +24,8 @@ from msg_adapters.topics import topic as topic_of
 STAGES = ("image", "sector", "sub_aperture", "shadow", "likelihood", "shadow_mask")
 #: Images kept in memory: twice the largest window.
 _CACHED = 16
+#: A longer step between two views is no pause but a clock that was set: circles take minutes.
+_LONGEST_PAUSE_S = 3600.0
 
 
 def header_stamp(cdr: Any, where: str) -> int:
@@ -106,6 +110,47 @@ def stage_of_bag(reader: BagReader, wanted: str = "auto") -> str:
     if wanted not in there:
         raise BagError(f"{reader.path} holds no {wanted}; it holds: {', '.join(there) or 'no stage'}")
     return wanted
+
+
+def schedule(times: Mapping[int, int]) -> tuple[dict[int, float], list[str]]:
+    """Say when each view is played at the recorded speed, and what of the recording's clock is not followed.
+
+    Parameters
+    ----------
+    times : mapping of int to int
+        Recording time (ns) of each stamp, in the order of playing.
+
+    Returns
+    -------
+    dict of int to float
+        Seconds from the first view, never falling.
+    list of str
+        One line for each step that was taken as long as most are: back, or longer than an hour.
+
+    Examples
+    --------
+    >>> seconds, notes = schedule({1: 0, 2: 10**9, 3: 2 * 10**9, 4: 9000 * 10**9})
+    >>> seconds
+    {1: 0.0, 2: 1.0, 3: 2.0, 4: 3.0}
+    >>> notes[0]
+    'the recorder set its clock by 8998 s before the view stamped 4 ns: played 1 s later'
+    """
+    stamps = list(times)
+    steps = [(times[b] - times[a]) / 1e9 for a, b in pairwise(stamps)]
+    sound = [step for step in steps if 0.0 <= step <= _LONGEST_PAUSE_S]
+    usual = median(sound) if sound else 0.0
+    at, notes = 0.0, []
+    found = {stamps[0]: 0.0} if stamps else {}
+    for stamp, step in zip(stamps[1:], steps, strict=True):
+        if not 0.0 <= step <= _LONGEST_PAUSE_S:
+            notes.append(
+                f"the recorder set its clock by {step:.6g} s before the view stamped {stamp} ns:"
+                f" played {usual:.3g} s later"
+            )
+            step = usual
+        at += step
+        found[stamp] = at
+    return found, notes
 
 
 class BagViews:
