@@ -58,8 +58,10 @@ _GRACE_S, _PATIENCE_S = 5.0, 120.0
 _SHARED_MEMORY = 1 << 30
 #: The middleware's segments, and the name of the file that their owner holds locked.
 _SEGMENTS, _OWNER = "/dev/shm/fastrtps_", "_el"
-#: How often it is looked which a process has: it makes them as it starts.
+#: How often it is looked which a process has, once it has some: it makes them as it starts.
 _LOOK_S = 1.0
+#: Who makes a segment holds its lock within milliseconds: one so old that nobody holds is nobody's.
+_LOCKED_S = 1.0
 #: Views are a few MB: by default glibc gives such memory back at once, and a quarter of the nodes' time went
 #: into getting it again, page by page.
 _MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(1 << 26), "MALLOC_TRIM_THRESHOLD_": str(1 << 28)}
@@ -118,13 +120,14 @@ class DomainReservation:
                     f"ROS domain {domain_id} is taken by another replay on this machine (UDP port"
                     f" {_ports_of(domain_id)[0] + _HELD}); expected a domain of its own"
                 )
-            self.domain_id, self._held = domain_id, held
+            self.domain_id, self._held, self._own = domain_id, held, False
             return
         # Linux hands out ports from 32768 on to whoever asks: domains up to 101 lie below them.
         for domain in random.sample(range(1, 102), 101):
             held = _bound(_ports_of(domain)[0] + _HELD)
             if held is None:
                 continue
+            self._own = True
             # Reserved first, then looked at: nobody else begins to use it in between.
             if _unused(domain):
                 self.domain_id, self._held = domain, held
@@ -139,7 +142,9 @@ class DomainReservation:
         self.close()
 
     def close(self) -> None:
-        """Let others have it."""
+        """Let others have it, after their processes' end; what killed ones left of it is removed."""
+        if self._own and self._held.fileno() >= 0 and _unused(self.domain_id):
+            remove_ports(self.domain_id)
         self._held.close()
 
 
@@ -204,6 +209,30 @@ def remove_segment(segment: Path) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         segment.unlink(missing_ok=True)
         owner.unlink(missing_ok=True)
+
+
+def remove_strays(since_s: float, until_s: float) -> None:
+    """Remove this user's segments that were made in a span of time (s since 1970) and whose owner died."""
+    folder = Path(_SEGMENTS).parent
+    for owner in folder.glob(f"{Path(_SEGMENTS).name}*{_OWNER}"):
+        with contextlib.suppress(OSError):
+            made = owner.stat()
+            mine = made.st_uid == os.getuid() and "_port" not in owner.name
+            if mine and since_s <= made.st_mtime <= min(until_s, time.time() - _LOCKED_S):
+                remove_segment(Path(str(owner).removesuffix(_OWNER)))
+
+
+def remove_ports(domain_id: int) -> None:
+    """Remove the ports in shared memory that killed processes left in a domain that nobody uses any more."""
+    for number in _ports_of(domain_id):
+        port = Path(f"{_SEGMENTS}port{number}")
+        owner = port.with_name(port.name + _OWNER)
+        with contextlib.suppress(OSError):
+            if owner.exists():
+                remove_segment(port)  # not one whose owner lives
+            if not owner.exists():
+                port.unlink(missing_ok=True)
+                port.with_name(f"sem.{port.name}_mutex").unlink(missing_ok=True)
 
 
 def graph_environment(domain_id: int, log_dir: Path, graph_id: str = "") -> dict[str, str]:
@@ -538,6 +567,7 @@ class GraphProcess:
         self._log_file: IO[bytes] | None = None
         self._segments: set[Path] = set()
         self._looked_s = -math.inf
+        self._began_s = 0.0
 
     @property
     def pid(self) -> int:
@@ -558,6 +588,7 @@ class GraphProcess:
         self.restarts += 1
         self._process = None
         self.clean_up()
+        self._began_s = time.time()
         if self._server is None:
             self._start_alone()
         else:
@@ -572,7 +603,7 @@ class GraphProcess:
 
     def look(self) -> None:
         """Note, now and then, which shared memory the process owns."""
-        if self._process is not None and time.monotonic() - self._looked_s > _LOOK_S:
+        if self._process is not None and (not self._segments or time.monotonic() - self._looked_s > _LOOK_S):
             self._looked_s = time.monotonic()
             self._segments |= segments_of(self._process.pid)
 
@@ -639,6 +670,10 @@ class GraphProcess:
             self._process.kill()
             self._process.wait()
 
+    def strays(self) -> tuple[float, float] | None:
+        """Return when a process that died may have made segments that nobody saw; None if they are known."""
+        return None if self._segments else (self._began_s, time.time())
+
     def close_log(self) -> None:
         """Close the log file."""
         if self._log_file is not None:
@@ -695,6 +730,7 @@ class Graph:
         self.max_restarts = max_restarts
         #: One line for each process that died.
         self.deaths: list[str] = []
+        self._strays: list[tuple[float, float]] = []
 
     def __enter__(self) -> Graph:
         try:
@@ -723,6 +759,8 @@ class Graph:
             if code is None:
                 process.look()
                 continue
+            if code < 0 and (span := process.strays()) is not None:
+                self._strays.append(span)
             if code == 2:
                 raise ReplayError(f"{name} refused to start: {process.last_line()}")
             how = f"was killed by signal {-code}" if code < 0 else f"ended with status {code}"
@@ -742,6 +780,12 @@ class Graph:
                 process.wait(30.0 if name == "bag_recorder" else 5.0)
                 process.close_log()
                 process.clean_up()
+            if self._strays:
+                # Of processes that were killed as soon as they had begun.
+                time.sleep(max(0.0, max(end for _, end in self._strays) + 1.1 * _LOCKED_S - time.time()))
+                for since_s, until_s in self._strays:
+                    remove_strays(since_s, until_s)
+                self._strays.clear()
         except BaseException:
             # Another Ctrl-C: no process is left behind for that, not even as a zombie.
             if self._server is not None:

@@ -213,8 +213,8 @@ class Flow:
             self._reported(peer, item)
 
     def _is_unable(self, peer: Peer, why: str) -> None:
-        """Wait, for a while, for a sink that says that it cannot work."""
-        if why and not peer.unable and peer.role == "sink":
+        """Wait, for a while, for a sink that was counted on and says that it cannot work."""
+        if why and not peer.unable and peer.role == "sink" and peer.alive:
             self._gone[peer.node, peer.stream] = self.clock()
             wait = f"it is waited for, {self.sink_wait_s:g} s at most"
             self.notes.append(("warn", f"{peer.node} cannot take {peer.stream}: {why}; {wait}"))

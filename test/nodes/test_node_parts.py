@@ -26,7 +26,7 @@ from csas_shadow_ros.nodes import params, qos
 from csas_shadow_ros.nodes.bag_player import BagPlayerNode
 from csas_shadow_ros.nodes.base import INTEGRATED, CsasNode, Inlet, Source, spin
 from csas_shadow_ros.nodes.composites import CompositesNode
-from csas_shadow_ros.nodes.playing import BagViews, header_stamp, stage_of_bag
+from csas_shadow_ros.nodes.playing import BagViews, header_stamp, schedule, stage_of_bag
 from csas_shadow_ros.nodes.shadow_likelihood import ShadowLikelihoodNode
 from csas_shadow_ros.nodes.sub_aperture import SubApertureNode
 from csas_shadow_ros.nodes.voxel_carver import VoxelCarverNode
@@ -424,3 +424,20 @@ def test_the_layouts_show_topics_of_the_contract() -> None:
     for topic in ("/csas/mesh", "/csas/voxels", "/csas/shadow/image"):
         assert topic in text
         assert topic in known
+
+
+def test_a_clock_that_was_set_or_a_pause_of_hours_holds_up_no_playing_and_is_told() -> None:
+    second = 10**9
+    years = 54 * 365 * 86400 * second
+    for times, expected, told in (
+        ({1: 0, 2: second, 3: 3 * second}, [0.0, 1.0, 3.0], 0),
+        ({1: 0, 2: 300 * second, 3: 301 * second}, [0.0, 300.0, 301.0], 0),  # a pause is kept
+        ({1: 0, 2: years, 3: years + second, 4: years + 2 * second}, [0.0, 1.0, 2.0, 3.0], 1),
+        ({1: years, 2: years + second, 3: 0, 4: second}, [0.0, 1.0, 2.0, 3.0], 1),
+        ({1: 7, 2: years}, [0.0, 0.0], 1),
+        ({}, [], 0),
+    ):
+        seconds, notes = schedule(times)
+        assert list(seconds) == list(times)
+        assert list(seconds.values()) == expected
+        assert len(notes) == told

@@ -28,6 +28,7 @@ from csas_shadow_ros.core.errors import BagError, NoTargetError, ParameterError,
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.pipeline import ProcessedView, Result, run
 from csas_shadow_ros.graph import (
+    DomainReservation,
     Graph,
     GraphProcess,
     ReplayError,
@@ -319,7 +320,9 @@ def running(graph: Graph, log_dir: Path, node: str) -> None:
     """Wait until a node's process takes part in the middleware."""
     deadline = time.monotonic() + 60
     pid = graph.processes[node].pid
-    while not [f for f in os.listdir(f"/proc/{pid}/task") if _name(pid, f).startswith("dds.")]:
+    while not (
+        segments_of(pid) and [f for f in os.listdir(f"/proc/{pid}/task") if _name(pid, f).startswith("dds.")]
+    ):
         assert time.monotonic() < deadline, (log_dir / f"{node}.log").read_text()
         time.sleep(0.05)
 
@@ -517,6 +520,30 @@ def test_variables_are_put_back_whoever_else_sets_some(monkeypatch: pytest.Monke
     thread.join()
     assert os.environ["CSAS_TEST_KEPT"] == "before"
     assert "CSAS_TEST_NEW" not in os.environ
+
+
+@pytest.mark.parametrize("forked", [False, True])
+def test_a_node_killed_in_its_first_moment_leaves_no_shared_memory(tmp_path: Path, forked: bool) -> None:
+    before = segments()
+    with contextlib.ExitStack() as stack:
+        domain = stack.enter_context(DomainReservation())
+        ports = {f"fastrtps_port{7400 + 250 * domain + n}" for n in range(250)}
+        server = stack.enter_context(start_fork_server(domain, tmp_path)) if forked else None
+        graph = stack.enter_context(Graph({"composites": {}}, domain, tmp_path, server=server))
+        pid = graph.processes["composites"].pid
+        deadline = time.monotonic() + 60
+        while not (lost := {path.name for path in segments_of(pid)}):
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        os.kill(pid, signal.SIGKILL)  # before the graph has looked at all
+        while not graph.deaths:
+            assert time.monotonic() < deadline
+            graph.watch()
+            time.sleep(0.01)
+        running(graph, tmp_path, "composites")
+    assert lost - before
+    assert not lost & segments()
+    assert not {name for name in segments() if name.removeprefix("sem.").removesuffix("_mutex") in ports}
 
 
 def readable(path: Path) -> bool:

@@ -160,6 +160,20 @@ def test_a_sink_that_cannot_work_is_waited_for_a_while_and_the_others_go_on() ->
     assert flow.next() == 1
 
 
+def test_a_pause_longer_than_a_replay_waits_for_news_is_played_as_it_was(
+    view_bag: Callable[[str], Path], reference: Reference, tmp_path: Path
+) -> None:
+    path, count = tmp_path / "pause", 0
+    with BagWriter(path) as writer:
+        for message in BagReader(view_bag("sub_aperture")).messages():
+            count += 1
+            when = (count > 30) * 24 * 10**9
+            writer.write(message.topic, message.cdr, when, type_name=message.type_name)
+    result = replay(path, tmp_path / "out", PARAMETERS, rate=1.0, progress=False, stall_timeout_s=15.0)
+    assert result.views_used == 36
+    assert result.lost == 0
+
+
 def test_what_a_recording_lacks_is_named(run_bag: Path, tmp_path: Path) -> None:
     result = replay(run_bag, tmp_path, PARAMETERS, record=True, composites=False, progress=False)
     assert result.not_recorded == []
