@@ -16,7 +16,6 @@ from ..core.errors import CsasError
 from ..core.mesh import Dimensions, measure
 from ..core.solid import judge_solid
 from ..core.volume import Volume, VoxelGrid
-from ..simulation.hull import enclosed_volume, iou, shadow_hull, voxelise_truth
 
 if TYPE_CHECKING:
     import trimesh
@@ -127,6 +126,8 @@ def read_truth(bag: str | Path) -> KnownTruth | None:
         mesh: Any = trimesh.load(str(stl), force="mesh", process=False)
         if not len(mesh.faces):
             raise ValueError("it holds no triangles")
+        from ..simulation.hull import enclosed_volume  # late: few bags have a truth
+
         solid = judge_solid(mesh)
         volume = math.nan if solid.open_edges else enclosed_volume(solid.mesh)
     except Exception as error:  # trimesh raises whatever its readers raise
@@ -215,6 +216,8 @@ def score(
     GeometryError
         If it reaches as high as the sonar.
     """
+    from ..simulation.hull import iou, shadow_hull, voxelise_truth  # late: few bags have a truth
+
     if truth.problem:
         raise TruthError(truth.problem)
     volume, before = _widened(truth, grid)

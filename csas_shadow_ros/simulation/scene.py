@@ -18,12 +18,11 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from ..core.errors import GeometryError
 from ..core.geometry import GroundGrid
+from .occlusion import make_tracer
 from .raster import fill_triangles
 from .targets import Scene, join_bodies
 
@@ -103,8 +102,7 @@ class SceneModel:
             solid = join_bodies(solids)
             self._triangles = np.asarray(solid.triangles, dtype=np.float64)
             self._face_normals = np.asarray(solid.face_normals, dtype=np.float64)
-            self._tracer = EmbreeScene()
-            TriangleMesh(self._tracer, self._triangles.astype(np.float32))
+            self._occluded = make_tracer(self._triangles)
             self._scatter_on(solid, rng, echo_db, scatterer_spacing_m)
         self._cables = np.concatenate(scene.cables) if scene.cables else np.zeros((0, 3))
         self._cable_amplitudes = self._cable_strength(scene.cables, cable_db, cell_m)
@@ -245,9 +243,4 @@ class SceneModel:
         return self._cables[free], self._cable_amplitudes[free]
 
     def _unhidden(self, origins: FloatArray, directions: FloatArray) -> NDArray[np.bool_]:
-        hit = self._tracer.run(
-            np.ascontiguousarray(origins, dtype=np.float32),
-            np.ascontiguousarray(directions, dtype=np.float32),
-            query="OCCLUDED",
-        )
-        return np.asarray(hit) < 0
+        return ~self._occluded(origins, directions)
