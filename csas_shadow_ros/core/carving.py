@@ -21,13 +21,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import lz4.block
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from .echo import echo_zone, opaque_part
 from .errors import ParameterError, ViewError
 from .geometry import View, ViewInfo
+from .kernels import kernel
 from .parameters import CarvingParameters
 from .seabed import SeabedSlope, seabed_slope, shadow_end
 from .threads import in_order
@@ -54,7 +54,7 @@ _UNKNOWN = 1 << 16
 _NOWHERE = np.empty((0, 0), np.bool_)
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
+@kernel(fastmath={"contract", "arcp", "nsz"})
 def _carve_slices(
     image: NDArray[np.float32],
     affines: NDArray[np.float64],
@@ -90,7 +90,7 @@ def _carve_slices(
                     count[k, j, i] += np.uint16(1)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _first_odd(mask: NDArray[np.uint8]) -> int:  # pragma: no cover
     """Return the first value that no mask may hold, -1 if there is none."""
     rows, cols = mask.shape
@@ -107,7 +107,7 @@ def _first_odd(mask: NDArray[np.uint8]) -> int:  # pragma: no cover
     return -1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _cells_of_mask(
     mask: NDArray[np.uint8],
     echo: NDArray[np.bool_],
@@ -147,7 +147,7 @@ def _cells_of_mask(
             cells[v, u] = code | ((right | low | both) & 16)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _alike(
     sums: NDArray[np.uint32],
     a: NDArray[np.float64],
@@ -185,7 +185,7 @@ def _alike(
     return _LIT if inside == np.uint32(area) else _MIXED
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
+@kernel(fastmath={"contract", "arcp", "nsz"})
 def _carve_masks(
     cells: NDArray[np.uint8],
     sums: NDArray[np.uint32],

@@ -10,13 +10,13 @@ import math
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from skimage.color import hsv2rgb
 
 from .errors import ParameterError, check_range
 from .geometry import TWO_PI, GroundGrid, View
+from .kernels import kernel
 
 FloatImage = NDArray[np.float32]
 
@@ -30,7 +30,7 @@ def _power(pixels: NDArray[Any]) -> FloatImage:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _power_of_parts(parts: FloatImage, out: FloatImage) -> None:  # pragma: no cover
     rows, cols = out.shape
     for v in range(rows):
@@ -39,7 +39,7 @@ def _power_of_parts(parts: FloatImage, out: FloatImage) -> None:  # pragma: no c
             to[u] = line[2 * u] * line[2 * u] + line[2 * u + 1] * line[2 * u + 1]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _add(
     warped: FloatImage,
     cosine: np.float32,

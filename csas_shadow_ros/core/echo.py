@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 
 import cv2
-import numba
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
 from .geometry import ViewInfo, unit_to_sonar
+from .kernels import kernel
 from .volume import Volume
 
 BoolArray = NDArray[np.bool_]
@@ -58,7 +58,7 @@ def opaque_part(occupied: BoolArray, grazing_rad: float, slack_voxels: float = 1
     return opaque
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _unhidden(
     opaque: BoolArray, i: float, j: float, k: float, di: float, dj: float, dk: float
 ) -> bool:  # pragma: no cover
@@ -75,7 +75,7 @@ def _unhidden(
         k += dk
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _seen(
     opaque: BoolArray, i: int, j: int, k: int, di: float, dj: float, dk: float, lift: float
 ) -> bool:  # pragma: no cover
@@ -95,7 +95,7 @@ def _seen(
     return free and _unhidden(opaque, i, j + face * a, k + lift, di, dj, dk)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def count_looks(
     voxels: NDArray[np.int32],
     opaque: BoolArray,
@@ -156,7 +156,7 @@ def count_looks(
         dark_seen[m] += dark[v, u]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _mark_echoes(
     occupied: BoolArray,
     opaque: BoolArray,

@@ -11,12 +11,12 @@ from functools import lru_cache
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import ViewError
 from .geometry import View
+from .kernels import kernel
 from .local_means import LocalMeans, Spans, known_span
 from .parameters import LikelihoodParameters
 
@@ -80,7 +80,7 @@ class Levels:
         return self.echoes(parameters.echo_db) if parameters.echo_unknown else np.zeros_like(self.known)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _l_out(power: np.float32, contrast2: np.float32, octaves: np.float32) -> np.float32:  # pragma: no cover
     """Evaluate `l_out` of one power, for (σ_r/σ_s)² and (1 - (σ_r/σ_s)²) / ln 2.
 
@@ -127,7 +127,7 @@ def l_out(power: FloatImage, contrast: float) -> FloatImage:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _l_out_of_all(
     power: FloatImage, contrast2: np.float32, octaves: np.float32, out: FloatImage
 ) -> None:  # pragma: no cover
@@ -135,7 +135,7 @@ def _l_out_of_all(
         out[i] = _l_out(power[i], contrast2, octaves)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _l_out_of_known(
     power: FloatImage,
     known: NDArray[np.bool_],
@@ -165,7 +165,7 @@ def expected_l_out(contrast: float) -> tuple[float, float]:
     return float(shadow.mean()), float(l_out(power, contrast).mean())
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _count_known(amplitude: FloatImage, enough: int) -> int:  # pragma: no cover
     """Count known pixels, row by row until there are enough."""
     count = 0
@@ -177,7 +177,7 @@ def _count_known(amplitude: FloatImage, enough: int) -> int:  # pragma: no cover
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _whole_blocks(
     amplitude: FloatImage,
     blocks: tuple[int, int],
@@ -300,7 +300,7 @@ def seabed_level(amplitude: FloatImage, background: str) -> FloatImage:
     return np.exp(_lattice_surface() @ coefficients).astype(np.float32) / np.float32(_MEDIAN_OVER_MODE)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _relative_power(
     amplitude: FloatImage,
     lattice: FloatImage,
@@ -344,7 +344,7 @@ def _relative_power(
             here[u] = value < np.float32(np.inf)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _interpolate(
     nodes: FloatImage, begins: NDArray[np.int64], part: FloatImage, first: int, last: int, line: FloatImage
 ) -> None:  # pragma: no cover

@@ -7,9 +7,10 @@ Half of a view is off the image: every row is looked at only where it knows some
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from .kernels import kernel
 
 FloatImage = NDArray[np.float32]
 BoolImage = NDArray[np.bool_]
@@ -31,7 +32,7 @@ _INNER = 2
 _index = np.uintp
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def known_span(known: BoolImage, v: int) -> tuple[int, int]:  # pragma: no cover
     """Return the columns between which a row knows anything: first, and one after the last."""
     cols = known.shape[1]
@@ -47,7 +48,7 @@ def known_span(known: BoolImage, v: int) -> tuple[int, int]:  # pragma: no cover
     return first, last
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _any(known: BoolImage, v: int, first: int) -> bool:  # pragma: no cover
     """Say whether a row knows any of `_CHUNK` pixels, without a branch for each."""
     some = False
@@ -56,7 +57,7 @@ def _any(known: BoolImage, v: int, first: int) -> bool:  # pragma: no cover
     return some
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _spans_of(known: BoolImage) -> Spans:  # pragma: no cover
     """Find the columns between which each row knows anything."""
     spans = np.empty((known.shape[0], 2), np.int32)
@@ -65,7 +66,7 @@ def _spans_of(known: BoolImage) -> Spans:  # pragma: no cover
     return spans
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _under(
     power: FloatImage,
     known: BoolImage,
@@ -123,7 +124,7 @@ def _under(
             marks[i] = here[i] & (total[i] > 0.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _any_over(
     power: FloatImage, v: int, first: int, last: int, least: np.float32
 ) -> bool:  # pragma: no cover
@@ -134,7 +135,7 @@ def _any_over(
     return some
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _mark_echoes(
     power: FloatImage, known: BoolImage, spans: Spans, threshold: float, out: BoolImage
 ) -> None:  # pragma: no cover
@@ -178,7 +179,7 @@ def _mark_echoes(
                         out[top:bottom, max(0, u - 1) : u + 2] = True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _interiors(
     power: FloatImage,
     known: BoolImage,

@@ -11,13 +11,13 @@ import math
 from dataclasses import replace
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from .carving import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from .errors import ViewError
 from .geometry import View, ViewInfo
+from .kernels import kernel
 from .likelihood import Levels, view_levels
 from .parameters import LikelihoodParameters
 
@@ -131,7 +131,7 @@ def segment_shadow(
     return replace(view, pixels=mask)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _compose(
     known: NDArray[np.bool_], echo: NDArray[np.bool_], mask: NDArray[np.uint8]
 ) -> None:  # pragma: no cover
@@ -141,7 +141,7 @@ def _compose(
         mask[i] = outside if known[i] & (not echo[i]) else unknown
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _add_shadow(
     shadow: NDArray[np.bool_], covered: NDArray[np.bool_], mask: NDArray[np.uint8]
 ) -> None:  # pragma: no cover
@@ -189,7 +189,7 @@ def _of_target(
         margin *= 2
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _patches_in_box(
     dark: NDArray[np.bool_],
     rows: tuple[int, int],
@@ -241,7 +241,7 @@ def _patches_in_box(
     return top, bottom, left, right
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _mark_before(
     shadow: NDArray[np.bool_], edge: NDArray[np.bool_], flank: int, out: NDArray[np.bool_]
 ) -> None:  # pragma: no cover

@@ -10,13 +10,13 @@ import math
 from dataclasses import dataclass, replace
 
 import ducc0
-import numba
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
 from .errors import ViewError
 from .geometry import View, ViewInfo, cross_range_axis, down_range_axis
+from .kernels import kernel
 from .parameters import ShadowParameters
 
 #: Rows after which a running product of phases starts anew: its rounding stays under 1e-5.
@@ -54,7 +54,7 @@ def focus_phase_rate(
     return info.acoustics.spectrum_sign * rate
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, error_model="numpy")
 def _apply_phase(
     rows: NDArray[np.complex64], first_m: float, step_m: float, rate: NDArray[np.float64]
 ) -> None:  # pragma: no cover
@@ -79,13 +79,13 @@ def _apply_phase(
             turn[k] *= by[k]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _finite(line: NDArray[np.float32], j: int) -> bool:  # pragma: no cover
     """Say whether pixel j of a row, real and imaginary parts in turns, is finite."""
     return bool(abs(line[2 * j]) < np.inf and abs(line[2 * j + 1]) < np.inf)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _known_pixels(
     pixels: NDArray[np.float32], first: int, ends: NDArray[np.int64], rows: NDArray[np.float32]
 ) -> int:  # pragma: no cover
@@ -121,7 +121,7 @@ def _known_pixels(
     return behind
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _known_amplitudes(
     pixels: NDArray[np.float32],
     first: int,

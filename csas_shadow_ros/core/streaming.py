@@ -14,7 +14,6 @@ from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
@@ -23,6 +22,7 @@ from .arcs import TOLERANCE_RAD, Arc, Arcs
 from .errors import GeometryError, NoTargetError, ViewError
 from .geometry import TWO_PI, CoherentImage, Track
 from .geometry.passage import passage
+from .kernels import kernel
 from .parameters import MAX_OBJECTS, PipelineParameters, SubApertureParameters, TargetParameters
 from .search.decision import Decision, decide_by_image
 from .sector import Sector, unlike
@@ -45,7 +45,7 @@ _LEAST_COSINE = 0.4
 _SEARCH_AGAIN_RAD = math.radians(30.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _arc_of_box(
     box: NDArray[np.complex64],
     first: tuple[int, int],

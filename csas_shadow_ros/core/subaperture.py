@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import ducc0
-import numba
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
@@ -34,6 +33,7 @@ from .geometry import (
     aspects_of_step,
     view_ground_to_pixel,
 )
+from .kernels import kernel
 from .parameters import SubApertureParameters
 from .taps import interpolate_four, interpolate_one
 
@@ -168,7 +168,7 @@ def _kernel_inverse(half: int, size: int) -> NDArray[np.float32]:
     return np.asarray(1.0 / transform, dtype=np.float32)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _half_size(
     edge_low: float,
     width: float,
@@ -186,7 +186,7 @@ def _half_size(
     return math.ceil(rows) + 1, math.ceil(cols) + 1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _cut_wedge(
     spectrum: NDArray[np.complex64],
     centre: tuple[int, int],
@@ -281,7 +281,7 @@ def _cut_wedge(
     return ahead, behind
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _span(slope: float, start: float, low: float, high: float, n: int) -> tuple[int, int]:  # pragma: no cover
     """Return from where to where, of 0 … n - 1, low <= slope i + start <= high."""
     first, last = 0, n
@@ -297,7 +297,7 @@ def _span(slope: float, start: float, low: float, high: float, n: int) -> tuple[
     return first, last
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _resample(
     box: NDArray[np.float32],
     table: NDArray[np.float32],

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from ..core.kernels import kernel
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -65,7 +66,7 @@ def embree_tracer(triangles_m: FloatArray) -> Tracer:
     return occluded
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel()
 def _meets_any(
     origins: FloatArray,
     directions: FloatArray,
@@ -106,8 +107,8 @@ def plain_tracer(triangles_m: FloatArray) -> Tracer:
 
     def occluded(origins: FloatArray, directions: FloatArray) -> BoolArray:
         out = np.zeros(len(origins), bool)
-        rays = (np.ascontiguousarray(a, dtype=np.float64) for a in (origins, directions))
-        _meets_any(*rays, corner, e1, e2, out)
+        origins, directions = (np.ascontiguousarray(a, dtype=np.float64) for a in (origins, directions))
+        _meets_any(origins, directions, corner, e1, e2, out)
         return out
 
     return occluded

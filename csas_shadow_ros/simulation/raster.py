@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.kernels import kernel
 
-@numba.njit(nogil=True, cache=True)
+
+@kernel()
 def fill_triangles(triangles: NDArray[np.float64], out: NDArray[np.uint8]) -> None:  # pragma: no cover
     """Set out[v, u] = 1 where the lattice point (u, v) lies inside any triangle.
 
@@ -48,7 +49,7 @@ def fill_triangles(triangles: NDArray[np.float64], out: NDArray[np.uint8]) -> No
                 out[v, u] = 1
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel()
 def add_windings(triangles: NDArray[np.float64], out: NDArray[np.int16]) -> None:  # pragma: no cover
     """Add ±1 at the voxel just under each crossing of a vertical line of voxel centres with a triangle.
 
@@ -86,7 +87,7 @@ def add_windings(triangles: NDArray[np.float64], out: NDArray[np.int16]) -> None
                     out[k, y, x] += sign
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel()
 def keep_shadowed(
     alive: NDArray[np.bool_],
     axes: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
