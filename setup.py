@@ -19,32 +19,35 @@ NODES = (
     "viewer",
 )
 
+# Floors are what Ubuntu 24.04 has beside ROS 2 Jazzy (constraints/noble.txt), and were tried.
 CORE = [
     "numpy>=1.26",
-    "scipy>=1.11",
+    "scipy>=1.11.4",
     "scikit-image>=0.22",
     "trimesh>=4.4",
-    "opencv-python-headless>=4.8",
-    "numba>=0.60",
+    "opencv-python-headless>=4.6",
+    "numba>=0.58.1",
     "ducc0>=0.34",
-    "matplotlib>=3.8",
+    "matplotlib>=3.6.3",
     "tqdm>=4.66",
     "PyYAML>=6.0",
     "mcap>=1.2",
     "zstandard>=0.22",
-    "lz4>=4.3",
+    "lz4>=4.0.2",
     # The bag format's reader and message definitions: its interface moves between minor versions.
     "rosbags>=0.11,<0.12",
-    # Ray casting of simulated scenes; an x86-64 and arm64 wheel exists for every supported Python.
-    "embreex>=2.17.7",
+    # Rays of simulated scenes, faster than our own; there is no wheel for Linux on ARM64.
+    'embreex>=2.17.7; sys_platform == "darwin" or platform_machine in "x86_64 AMD64"',
     # The operator's view: its server, and pictures of views.
-    "aiohttp>=3.10,<4",
+    "aiohttp>=3.9.1,<4",
     "pillow>=10.1",
 ]
 # ROS 2 Jazzy from PyPI, in versions that were tried together. Where ROS 2 is installed by other means
-# (apt, conda, source) this extra is not needed and would be in the way.
+# (apt, conda, source) this extra is not needed and would be in the way. The wheels are for x86-64 alone.
 ROS = ["ros-rclpy==7.1.6", "ros-rmw-fastrtps-cpp==8.4.3", "ros-common-interfaces==5.3.6"]
-TEST = ["pytest>=8", "pytest-xdist>=3.5", "hypothesis>=6.100", "ruff~=0.17.6", "mypy~=2.4.1"]
+# pytest 8 does not start beside Jazzy's launch_testing: Ubuntu 24.04 has 7.4.4.
+TEST = ["pytest>=7.4.4", "pytest-xdist>=3.4", "hypothesis>=6.98", "ruff~=0.17.6", "mypy~=2.4.1"]
+TEST += ["packaging>=23"]
 # The viewer's page is tested in Debian's chromium; no browser is downloaded.
 TEST += ["playwright>=1.49,<2"]
 # The benchmark compares with the fastest FFT library that can be had: a floor to measure against.
@@ -108,6 +111,10 @@ setup(
     maintainer_email="csas-shadow-ros@example.com",
     license="MIT",
     python_requires=">=3.10,<3.14",
+    classifiers=[
+        "Operating System :: POSIX :: Linux",
+        *(f"Programming Language :: Python :: 3.{minor}" for minor in range(10, 14)),
+    ],
     packages=find_packages(include=[f"{NAME}*", "msg_adapters*"]),
     package_data={
         NAME: ["py.typed", "**/*.html", "**/*.js", "**/*.css", "**/*.svg", "**/*.xml", "**/*.yaml"],

@@ -1,4 +1,4 @@
-"""The command line: ``csas-shadow simulate | check | info | run | replay | view``."""
+"""The command line: ``csas-shadow simulate | check | info | run | replay | view | warm``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 from . import __version__
 from .core.errors import CsasError, ParameterError
-from .core.parameters import STAGES, PipelineParameters
+from .core.parameters import STAGES, START_FROM, PipelineParameters
 
 PROGRAM = "csas-shadow"
 ALL_RUNS = "all"
@@ -292,6 +292,16 @@ def build_parser() -> argparse.ArgumentParser:
     _add_run(add)
     _add_replay(add)
     _add_view(add)
+    warm = add(
+        "warm",
+        "compile all kernels, which takes a minute, once for all users of this installation",
+        "  csas-shadow warm\n\n"
+        "Kernels are kept in the package's folder, else in the user's cache, else in the temporary folder:\n"
+        "the first that can be written, or NUMBA_CACHE_DIR. Run it as whoever installs, on the machine\n"
+        "that will run the nodes, or on one with the same processor.",
+        _warm,
+    )
+    _common(warm)
     return parser
 
 
@@ -458,8 +468,6 @@ def _add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _run_options(p: argparse.ArgumentParser) -> None:
-    from .process import START_FROM
-
     p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
     p.add_argument("--namespace", help="namespace of its topics (found by itself)")
     _run_option(p, each=True)
@@ -495,8 +503,6 @@ def _add_replay(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _replay_options(p: argparse.ArgumentParser) -> None:
-    from .process import START_FROM
-
     p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
     p.add_argument(
         "--start-from",
@@ -659,6 +665,29 @@ def _view(arguments: argparse.Namespace, console: Console) -> int:
         browser=not arguments.no_browser,
         say=say,
     )
+    return OK
+
+
+def _warm(arguments: argparse.Namespace, console: Console) -> int:
+    from .core import kernels
+    from .core.warm import warm_all
+    from .simulation.warm import warm_simulation
+
+    start = time.perf_counter()
+    warm_all()
+    warm_simulation()
+    seconds = time.perf_counter() - start
+    loaded, compiled = kernels.counts()
+    place = kernels.place()
+    document = {
+        "compiled": compiled,
+        "loaded": loaded,
+        "seconds": seconds,
+        "place": place.kind,
+        "folder": place.folder and str(place.folder),
+    }
+    text = f"{compiled} kernels compiled, {loaded} were there; {seconds:.1f} s; kept: {place}"
+    console.result(text, document)
     return OK
 
 

@@ -20,15 +20,12 @@ from .bags.metadata import read_metadata
 from .core.arcs import Arc, Arcs
 from .core.errors import BagError, CsasError, ParameterError, SpectrumSignError
 from .core.geometry import CoherentImage, Track, View, looks_at
-from .core.parameters import MAX_OBJECTS, PipelineParameters
+from .core.parameters import MAX_OBJECTS, START_FROM, PipelineParameters
 from .core.pipeline import Result
 from .core.pipeline import run as run_pipeline
 from .core.search.decision import Decision, decide_by_views
 from .core.stages import STAGES, run_views, with_spectrum_sign
 from .results import Context, ResultsWriter
-
-#: What a run can start from; auto takes the first that the bag holds.
-START_FROM = ("auto", "image", *STAGES)
 
 Progress = Callable[[int, int], None]
 Notice = Callable[[str], None]

@@ -221,7 +221,7 @@ def echo_zone(info: ViewInfo, volume: Volume, occupied: BoolArray, opaque: BoolA
     affine = np.array(camera.ground_to_pixel[:2])
     affine[:, 2] += (cols, rows)
     _mark_echoes(
-        occupied,
+        np.ascontiguousarray(occupied),  # a part of a grid would need a kernel of its own
         opaque,
         np.asarray(volume.origin_m, dtype=np.float64),
         volume.voxel_size_m,

@@ -48,6 +48,9 @@ class Place:
     kind: str
     folder: Path | None
 
+    def __str__(self) -> str:
+        return self.kind if self.folder is None else f"{self.folder} ({self.kind})"
+
 
 def package_folder() -> Path:
     """Return where kernels are kept if the package's folder can be written."""
@@ -166,3 +169,10 @@ def kernel(**options: Any) -> Callable[[Function], Function]:
         return made  # type: ignore[no-any-return]
 
     return compiled
+
+
+def counts() -> tuple[int, int]:
+    """Return how many kernels this process loaded, and how many it compiled; variants of one count."""
+    stats = [k.stats for k in KERNELS]
+    loaded = sum(sum(s.cache_hits.values()) for s in stats)
+    return loaded, sum(sum(s.cache_misses.values()) for s in stats)

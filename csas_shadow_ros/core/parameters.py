@@ -220,6 +220,11 @@ class TargetParameters(Parameters):
     )
 
 
+#: Stages whose views a run can start from, first to last.
+VIEW_STAGES = ("sub_aperture", "shadow", "likelihood", "shadow_mask")
+#: What a run can start from; auto takes the first that the bag holds.
+START_FROM = ("auto", "image", *VIEW_STAGES)
+
 STAGES: dict[str, type[Parameters]] = {
     "sub_aperture": SubApertureParameters,
     "shadow": ShadowParameters,

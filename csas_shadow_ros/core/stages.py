@@ -13,13 +13,13 @@ from dataclasses import replace
 
 from .errors import ParameterError, ViewError
 from .geometry import View
-from .parameters import MAX_OBJECTS, PipelineParameters
+from .parameters import MAX_OBJECTS, VIEW_STAGES, PipelineParameters
 from .pipeline import ProcessedView, Result, process
 from .reconstruction import Reconstruction
 from .search.decision import Decision, decide_by_views
 
 #: Stages that a run can start from, first to last.
-STAGES = ("sub_aperture", "shadow", "likelihood", "shadow_mask")
+STAGES = VIEW_STAGES
 
 
 def run_views(

@@ -1,13 +1,15 @@
 """Load the compiled kernels of each stage before the first view needs them.
 
 Numba keeps kernels on disk and loads each when it is first called, and some libraries are imported when they
-are first used. A stream's first sectors would wait for all of that, one stage after the other.
+are first used. A stream's first sectors would wait for all of that, one stage after the other. Pixels of
+messages cannot be written, those that a stage hands to the next can: numba compiles a kernel for each.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -58,6 +60,14 @@ def _shadow_view() -> View:
     return replace(view, pixels=np.abs(view.pixels).astype(np.float32))
 
 
+def _both(view: View) -> Iterator[View]:
+    """Give a view as the stage before hands it over, and as it comes in a message."""
+    yield view
+    pixels = view.pixels.copy()
+    pixels.flags.writeable = False
+    yield replace(view, pixels=pixels)
+
+
 def _sample(**given: View) -> ProcessedView:
     """Begin with a stage of the sample view."""
     from .parameters import PipelineParameters
@@ -69,20 +79,23 @@ def _sample(**given: View) -> ProcessedView:
 
 def warm_enhancement() -> None:
     """Enhance a sample view."""
-    _sample(sub_aperture=sample_view()).require("shadow")
+    for view in _both(sample_view()):
+        _sample(sub_aperture=view).require("shadow")
 
 
 def warm_likelihood() -> None:
     """Take a sample view through levels, likelihood and segmentation."""
-    made = _sample(shadow=_shadow_view())
-    for part in ("levels", "likelihood", "mask"):
-        made.require(part)
+    for view in _both(_shadow_view()):
+        made = _sample(shadow=view)
+        for part in ("levels", "likelihood", "mask"):
+            made.require(part)
 
 
 def warm_carving(parameters: CarvingParameters | None = None) -> None:
     """Carve a few voxels with a sample view by a method, and look at them as at the end of a run."""
     from .carving import Carver
     from .hollows import matter_of
+    from .measurement import levels_of_mask, silhouette_sides
     from .mesh import measure, mesh_from_grid
     from .volume import Volume
 
@@ -94,16 +107,20 @@ def warm_carving(parameters: CarvingParameters | None = None) -> None:
     else:
         pixels = np.clip(shadow.pixels, 0.0, 1.0)
     view = replace(shadow, pixels=pixels)
+    if p.takes_masks:
+        silhouette_sides(levels_of_mask(view), view, _TARGET_M)
     carver = Carver(Volume.around(_TARGET_M, (0.6, 0.6, 0.3), 0.05), p)
-    carver.integrate(view)
+    for stamp, one in enumerate(_both(view), start=1):
+        carver.integrate(replace(one, info=replace(one.info, stamp_ns=stamp)))
     grid = carver.grid()
     occupied = np.zeros(grid.volume.shape, bool)
     occupied[:3, 4:8, 4:8] = True
     grid = replace(grid, occupied=occupied, likelihood=np.where(occupied, 0.0, 1.0).astype(np.float32))
     measure(mesh_from_grid(grid))
-    made = _sample(shadow=shadow)
-    matter_of(grid, [made.require("look")])
-    getattr(made, "sides")  # noqa: B009  (made when it is asked for)
+    for one in _both(shadow):
+        made = _sample(shadow=one)
+        matter_of(grid, [made.require("look")])
+        getattr(made, "sides")  # noqa: B009  (made when it is asked for)
 
 
 def warm_sub_apertures() -> None:
@@ -123,6 +140,7 @@ def warm_sub_apertures() -> None:
         k = _ACOUSTICS.ground_wavenumber(f_c, track.grazing_rad) * unit_to_sonar(aspect)
         carrier = (float(k[0]), float(k[1]))
         pixels = _speckle(_SIDE, _SIDE)
+        pixels.flags.writeable = stamp == 1
         total.add(Sector(pixels, grid, _ACOUSTICS, stamp, aspect, math.radians(30.0), carrier))
     made = SubApertures(total.frame, track, SubApertureParameters(), spectrum=total.spectrum)
     made.view_of_aspect(0.2)
@@ -132,5 +150,16 @@ def warm_composites() -> None:
     """Add a sample view to the images of the circle."""
     from .composites import Composites
 
-    view = sample_view()
-    Composites.for_view(view).integrate(view)
+    for view in _both(sample_view()):
+        Composites.for_view(view).integrate(view)
+
+
+def warm_all() -> None:
+    """Call every stage's kernels: compiled once, they are loaded from then on."""
+    warm_sub_apertures()
+    warm_enhancement()
+    warm_likelihood()
+    (method,) = (f for f in fields(CarvingParameters) if f.name == "method")
+    for name in method.metadata["choices"]:
+        warm_carving(CarvingParameters(method=name))
+    warm_composites()

@@ -674,3 +674,26 @@ def test_the_package_runs_as_a_module():
     )
     assert done.returncode == 0
     assert done.stdout.startswith("csas-shadow ")
+
+
+def test_warm_tells_what_it_compiled_and_where_that_is_kept():
+    said = Said("warm", "--json")
+    assert said.code == 0, said.err
+    told = said.json
+    assert told["compiled"] + told["loaded"] > 30
+    assert Path(told["folder"]).is_dir()
+    again = Said("warm")
+    assert told["folder"] in again.out
+
+
+@pytest.mark.parametrize("arguments", [(), ("run",), ("replay",), ("check",), ("view",), ("warm",)])
+def test_help_comes_before_any_numerical_library(arguments):
+    code = (
+        "import sys; from csas_shadow_ros.cli import main\n"
+        "try: main(sys.argv[1:])\n"
+        "except SystemExit: pass\n"
+        "print(sorted({'numpy', 'scipy', 'numba', 'cv2', 'rosbags', 'yaml'} & set(sys.modules)))"
+    )
+    command = [sys.executable, "-c", code, *arguments, "--help"]
+    told = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    assert told.splitlines()[-1] == "[]"
