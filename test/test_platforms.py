@@ -106,6 +106,12 @@ def test_the_constraints_of_noble_fit_what_is_required_and_what_apt_has() -> Non
             assert CORE[name].specifier.contains(pinned), f"{constraint} is refused by {CORE[name]}"
 
 
+def test_no_figure_asks_for_a_legend_that_matplotlib_3_6_cannot_place() -> None:
+    files = list((ROOT / "csas_shadow_ros").rglob("*.py"))
+    assert len(files) > 50
+    assert [f.name for f in files if 'loc="outside' in f.read_text()] == []
+
+
 def test_no_python_is_declared_that_is_not_allowed_and_none_is_left_out() -> None:
     text = (ROOT / "setup.py").read_text()
     assert 'python_requires=">=3.10,<3.14"' in text

@@ -468,7 +468,8 @@ def figure_7(subject: Subject) -> Figure:
     picture[mask.pixels == MASK_SHADOW] = colours["shadow"]
     _show_view(b, subject, mask, picture, "(b) segmented automatically")
     handles = [Patch(facecolor=c, edgecolor="0.3", label=n) for n, c in colours.items()]
-    figure.legend(handles=handles, loc="outside lower right", ncols=4, frameon=False)
+    # Below its axes: a legend "outside" the figure needs matplotlib 3.7, and Ubuntu 24.04 has 3.6.
+    b.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False)
     figure.suptitle(f"Segmentation of the shadow at θ₀ = {_degrees(shadow):.0f}° (the sonar is above)")
     return figure
 
