@@ -468,8 +468,10 @@ def figure_7(subject: Subject) -> Figure:
     picture[mask.pixels == MASK_SHADOW] = colours["shadow"]
     _show_view(b, subject, mask, picture, "(b) segmented automatically")
     handles = [Patch(facecolor=c, edgecolor="0.3", label=n) for n, c in colours.items()]
-    # Below its axes: a legend "outside" the figure needs matplotlib 3.7, and Ubuntu 24.04 has 3.6.
-    b.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False)
+    # Room for the legend is made by hand: "outside" takes matplotlib 3.7, and Ubuntu 24.04 has 3.6.
+    engine: Any = figure.get_layout_engine()
+    engine.set(rect=(0.0, 0.06, 1.0, 0.94))
+    figure.legend(handles=handles, loc="lower right", ncols=4, frameon=False)
     figure.suptitle(f"Segmentation of the shadow at θ₀ = {_degrees(shadow):.0f}° (the sonar is above)")
     return figure
 
