@@ -16,18 +16,20 @@ echo can cover; the others are seabed, and carve what the first look left standi
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
-import lz4.block
 import numpy as np
 from numpy.typing import NDArray
 
 from .echo import echo_zone, opaque_part
 from .errors import ParameterError, ViewError
+from .explained import count_shadow_pixels, unexplained_shadow
 from .geometry import View, ViewInfo
 from .kernels import kernel
+from .masks import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, KeptMask
 from .parameters import CarvingParameters
 from .seabed import SeabedSlope, seabed_slope, shadow_end
 from .threads import in_order
@@ -36,9 +38,6 @@ from .volume import Volume, VoxelGrid
 
 #: l_out is accumulated in steps of 1/4096, far below the spread of its estimate.
 _SCALE = 4096
-#: Values of a shadow mask (mono8). Covered: lit, between an echo and the shadow behind it; either the
-#: target's own echo, laid over what it hides, or seabed that is seen under it.
-MASK_OUTSIDE, MASK_COVERED, MASK_UNKNOWN, MASK_SHADOW = 0, 64, 128, 255
 #: The second look is taken so many voxels round what the first one left.
 _SECOND_LOOK_VOXELS = 2
 #: Threads that do it.
@@ -273,29 +272,6 @@ def _threads(pool: ThreadPoolExecutor | None, work: Any, slices: int) -> None:
     upper.result()
 
 
-@dataclass(frozen=True, eq=False)
-class KeptMask:
-    """A shadow mask, kept small: some kB for a view."""
-
-    info: ViewInfo
-    packed: bytes
-
-    @classmethod
-    def of(cls, view: View) -> KeptMask:
-        """Keep a mask."""
-        return cls(view.info, lz4.block.compress(np.ascontiguousarray(view.pixels)))
-
-    @property
-    def grazing_quarters(self) -> int:
-        """Grazing angle in quarters of a degree."""
-        return round(math.degrees(self.info.camera.grazing_rad) * 4.0)
-
-    def view(self) -> View:
-        """Return the mask as it was."""
-        pixels = np.frombuffer(lz4.block.decompress(self.packed), np.uint8)
-        return View(self.info, pixels.reshape(self.info.camera.shape))
-
-
 class _Sums:
     """What has been added to each voxel of a volume: how many views, and their whole numbers.
 
@@ -509,15 +485,15 @@ class Carver:
         VoxelGrid
             With NaN threshold and nothing occupied where there is no object.
         """
-        first = self.first_look()
+        carver, first = self, self.first_look()
         if self.parameters.method != "consensus" or not first.occupied.any():
             return first
         slope = self._slope(first)
-        if slope is None or not slope.believed:
-            return replace(self._second_look(first), seabed=slope)
-        over = self._over(slope)
-        first = over.first_look()
-        return replace(over._second_look(first) if first.occupied.any() else first, seabed=slope)
+        if slope is not None and slope.believed:
+            # Carve again from the same masks, over a seabed that slopes.
+            carver = self._again(lambda kept: KeptMask(slope.applied(kept.info), kept.packed))
+            first = carver.first_look()
+        return replace(carver._shape(first) if first.occupied.any() else first, seabed=slope)
 
     def _slope(self, first: VoxelGrid) -> SeabedSlope | None:
         """Fit the seabed's slope to the far ends of all silhouettes."""
@@ -533,14 +509,45 @@ class Carver:
                 return None
         return slope
 
-    def _over(self, slope: SeabedSlope) -> Carver:
-        """Carve again from the same masks, over a seabed that slopes."""
-        over = Carver(self.volume, self.parameters, pool=self._pool)
-        for stamp, kept in self._masks.items():
-            over._masks[stamp] = KeptMask(slope.applied(kept.info), kept.packed)
-            over._sums.add_mask(kept.view().pixels, over._masks[stamp].info)
-        over.stamps = set(self.stamps)
-        return over
+    def _again(self, change: Callable[[KeptMask], KeptMask]) -> Carver:
+        """Carve the same masks again, each changed."""
+        again = Carver(self.volume, self.parameters, pool=self._pool)
+        for (stamp, _), kept in in_order(lambda item: change(item[1]), self._masks.items(), _LOOKERS):
+            again._masks[stamp] = kept
+            again._sums.add_mask(kept.view().pixels, kept.info)
+        again.stamps = set(self.stamps)
+        return again
+
+    def _shape(self, first: VoxelGrid) -> VoxelGrid:
+        """Leave of what covered pixels leave open what the shadows ask for.
+
+        Taken for lit seabed, covered pixels far before a shadow carve low wide bodies away with their own lit
+        tops; taken for unknown, they leave an apron round open ones. The leaner body counts, and what of the
+        fuller one darkens pixels of the silhouettes that the leaner one leaves lit.
+        """
+        fuller = self._second_look(first)
+        lean = self._again(KeptMask.near)
+        leaner = lean.first_look()
+        if leaner.occupied.any():
+            leaner = lean._second_look(leaner)
+        voxels = np.argwhere(fuller.occupied & ~leaner.occupied).astype(np.int32)
+        if not len(voxels):
+            return fuller
+        asked = np.zeros(len(voxels), np.int32)
+
+        def unexplained(kept: KeptMask) -> tuple[View, NDArray[np.bool_]]:
+            view = kept.view()
+            return view, unexplained_shadow(view, self.volume, leaner.occupied)
+
+        for _, (view, dark) in in_order(unexplained, self._masks.values(), _LOOKERS):
+            count_shadow_pixels(view, self.volume, voxels, dark, asked)
+        keep = leaner.occupied.copy()
+        # As many views must ask for a voxel as would remove it.
+        keep[tuple(voxels.T)] = asked >= fuller.threshold * fuller.views[tuple(voxels.T)]
+        for k in range(len(keep) - 2, -1, -1):  # what is asked for stands on all of the fuller body
+            keep[k] |= keep[k + 1] & fuller.occupied[k]
+        likelihood = np.where(keep, fuller.likelihood, np.fmax(leaner.likelihood, fuller.likelihood))
+        return thresholded(self.volume, likelihood, fuller.views, self.parameters)
 
     def first_look(self) -> VoxelGrid:
         """Threshold what has been carved so far, covered pixels unknown: what `grid` starts from."""

@@ -28,10 +28,10 @@ import scipy.ndimage
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from .carving import MASK_SHADOW, MASK_UNKNOWN
 from .geometry import TWO_PI, View, ViewInfo, cross_range_axis, down_range_axis
 from .likelihood import Levels
 from .local_means import LocalMeans
+from .masks import MASK_SHADOW, MASK_UNKNOWN
 from .mesh import Dimensions, digits_of, measure
 from .seabed import largest_piece
 from .volume import VoxelGrid
@@ -79,6 +79,10 @@ _VOXEL_WEIGHT = 0.1
 _FOREIGN_CELLS = 3.0
 #: Fewer edges than this give no plan: the voxels alone are measured then.
 _MIN_EDGES = 24
+#: Sides that scatter about the fitted plan by more than this (cross-range cells, 1σ) are not those of one
+#: plan: edges are found to a fraction of a cell. Simulated targets scatter by 0.19 to 0.57, the chips of a
+#: measured vehicle, which were cut out one by one (docs/examples.md), by 1.8.
+_ONE_PLAN_CELLS = 1.0
 #: Resamplings of the views.
 _RESAMPLINGS = 20
 #: Error of one extent besides what resampling shows (1σ), in cross-range cells: edges are found to a fraction
@@ -353,6 +357,8 @@ class PlanFit:
         self._values = np.concatenate([seen[:, 1], own]) - about
         self._weights = np.concatenate([np.ones(self.count), np.full(_DIRECTIONS, _VOXEL_WEIGHT)])
         self._robust = np.ones_like(self._weights)
+        #: How far sides scatter about the plan, 1σ, m.
+        self.spread_m = 0.0
         self.view_of = seen[:, 3].astype(np.intp)
         self._face(coarse)
         radii = self._solve(self._weights)[: len(coarse)]
@@ -397,7 +403,7 @@ class PlanFit:
         for _ in range(rounds):
             solution = self._solve(self._weights * self._robust)
             residual = (self._values - self._design @ solution)[: self.count]
-            spread = 1.4826 * float(np.median(np.abs(residual))) + 1e-4
+            spread = self.spread_m = 1.4826 * float(np.median(np.abs(residual))) + 1e-4
             self._robust[: self.count] = np.sqrt(np.clip(1.0 - (residual / (4.0 * spread)) ** 2, 0.0, None))
         return np.asarray(self._basis(self.directions) @ solution)
 
@@ -582,8 +588,8 @@ def measure_object(
     Returns
     -------
     Dimensions
-        Length, width, heading and position of the plan, from the silhouettes (from the surface where the
-        aperture is too narrow to smear them by half a voxel and a quarter of a cell); height from the
+        Length, width, heading and position of the plan, from the silhouettes (from the surface where their
+        sides scatter by more than a cell about the best plan); height from the
         shadows' lengths if these agree on one, otherwise from the carved layers; volume of the surface.
         Intervals of length and width come from resampling the views in blocks of an aperture (neighbours
         share their looks), with the error of an edge (0.6 of a cross-range cell) added in quadrature.
@@ -603,10 +609,9 @@ def measure_object(
     down, across = (float(np.median([s.info.resolution_m[axis] for s in sides])) for axis in (0, 1))
     edge = _EDGE_CELLS * across
     d = grid.volume.voxel_size_m
-    aperture = float(np.median([side.info.aperture_rad for side in sides]))
-    if 0.5 * whole.length_m * aperture / 4.0 < 0.5 * d + 0.25 * across:
-        # The aperture hardly smears the sides: the voxels are right about them, and also know low parts of
-        # the target whose own sides the echo covers in each view.
+    if fit.spread_m > _ONE_PLAN_CELLS * across:
+        # No one plan has these sides, as where each view lies at a place of its own: the voxels, which a few
+        # views do not move, are what all agree on.
         plan = _Rectangle(whole.length_m, whole.width_m, whole.heading_rad, whole.position_m)
     intervals = {}
     for name in ("length_m", "width_m"):

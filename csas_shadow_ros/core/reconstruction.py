@@ -19,12 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arcs import Arc, Arcs
-from .carving import Carver, KeptMask
+from .carving import Carver
 from .composites import Composites
 from .errors import ViewError
 from .geometry import View, ViewInfo
 from .hollows import EchoLook, matter_mesh, matter_of
 from .likelihood import Levels
+from .masks import KeptMask
 from .measurement import SilhouetteSides, levels_of_mask, measure_object, shadow_height, silhouette_sides
 from .mesh import Dimensions, measure, mesh_from_grid
 from .parameters import PipelineParameters

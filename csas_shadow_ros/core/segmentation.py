@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .carving import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from .errors import ViewError
 from .geometry import View, ViewInfo
 from .kernels import kernel
 from .likelihood import Levels, view_levels
+from .masks import BESIDE, FLANK_PX, MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from .parameters import LikelihoodParameters
 
 #: Shadow where the local mean power is less than this far from the shadow's level to the seabed's. At a
@@ -30,10 +30,6 @@ _DARK = 0.37
 _HALF_CELLS = (1.8, 0.75)
 #: The averaging box reaches no farther than this (pixels).
 _MAX_RADIUS = 8
-#: The flank of a shadow without an echo before it (pixels).
-_FLANK_PX = 2
-#: An echo speaks for as many columns on either side.
-_BESIDE = 2
 #: How far around the target is looked at first (pixels), and how much farther down-range, where shadows lie.
 _MARGIN_PX = 16
 _LONGER = 8
@@ -119,16 +115,29 @@ def segment_shadow(
     _compose(levels.known.ravel(), echo.ravel(), mask.ravel())
     shadow, (top, left) = _of_target(levels, view.info, target_m, reach_m)
     if shadow.size:
-        # What is covered reaches up-range by no more than the shadow's length, and is told by echoes two
-        # columns beside it.
-        begin, before = max(0, top - len(shadow)), max(0, left - _BESIDE)
+        # What is covered begins on the target, and is told by echoes two columns beside it.
+        begin = max(0, min(top - len(shadow), _near_end(view.info, target_m, reach_m)))
+        before = max(0, left - BESIDE)
         rows, cols = slice(begin, top + len(shadow)), slice(left, left + shadow.shape[1])
         shadow = np.pad(shadow, ((top - begin, 0), (0, 0)))
         covered = np.zeros_like(shadow)
         if p.echo_unknown:
-            _before_shadow(shadow, echo[rows, before : cols.stop + _BESIDE], left - before, covered)
+            echoes = echo[rows, before : cols.stop + BESIDE]
+            _before_shadow(shadow, echoes, left - before, view.info, covered)
         _add_shadow(shadow, covered, mask[rows, cols])
     return replace(view, pixels=mask)
+
+
+def _near_end(info: ViewInfo, target_m: tuple[float, float], reach_m: float) -> int:
+    """Return the row up-range of which no part of the target stands."""
+    camera = info.camera
+    row = (camera.ground_to_pixel @ np.array([target_m[0], target_m[1], 1.0]))[1]
+    return int(row - _reach(info, reach_m) / camera.spacing_m[0])
+
+
+def _reach(info: ViewInfo, reach_m: float) -> float:
+    """Return how far from its position the target may reach (m); by default a tenth of the view."""
+    return reach_m or 0.1 * info.camera.cols * info.camera.spacing_m[1]
 
 
 @kernel()
@@ -161,7 +170,7 @@ def _of_target(
     camera = info.camera
     u, v, _ = camera.ground_to_pixel @ np.array([target_m[0], target_m[1], 1.0])
     rows_m, cols_m = camera.spacing_m
-    reach = reach_m or 0.1 * camera.cols * cols_m
+    reach = _reach(info, reach_m)
     # A patch belongs to the target if any of it lies in the box that the target's near shadow must cross.
     top, bottom = v - reach / rows_m, v + (reach + reach / math.tan(camera.grazing_rad) / 4.0) / rows_m
     left, right = u - reach / cols_m, u + reach / cols_m
@@ -243,23 +252,29 @@ def _patches_in_box(
 
 @kernel()
 def _mark_before(
-    shadow: NDArray[np.bool_], edge: NDArray[np.bool_], flank: int, out: NDArray[np.bool_]
+    shadow: NDArray[np.bool_],
+    edge: NDArray[np.bool_],
+    inside: NDArray[np.int32],
+    rows_a_column: float,
+    flank: int,
+    out: NDArray[np.bool_],
 ) -> None:  # pragma: no cover
     """Mark, up-range of every stretch of shadow in every column, what an echo leads up to."""
     rows, cols = shadow.shape
-    # Row by row, as they lie in memory: where each column's stretch began, if it is in one.
-    starts = np.full(cols, -1, np.int32)
+    # Row by row, as they lie in memory: where each column's stretch began, if it is in one, and how deep.
+    starts, depth = np.full(cols, -1, np.int32), np.zeros(cols, np.int32)
     for i in range(rows + 1):
         for j in range(cols):
             start = starts[j]
-            dark = i < rows and shadow[i, j]
-            if dark == (start >= 0):
+            if i < rows and shadow[i, j]:
+                if start < 0:
+                    starts[j], depth[j] = i, 0
+                depth[j] = max(depth[j], inside[i, j])
                 continue
-            if dark:
-                starts[j] = i
+            if start < 0:
                 continue
-            reach = max(0, start - (i - start))
-            begin = max(reach, start - flank)
+            reach = max(0, start - max(i - start, int(depth[j] * rows_a_column)))
+            begin = max(0, start - flank)
             for k in range(reach, start):
                 if edge[k, j]:
                     begin = min(begin, k)
@@ -269,21 +284,50 @@ def _mark_before(
             starts[j] = -1
 
 
+@kernel()
+def _columns_inside(shadow: NDArray[np.bool_], out: NDArray[np.int32]) -> None:  # pragma: no cover
+    """Count, for each dark pixel, the columns to the nearer end of its row's dark run; 0 elsewhere."""
+    rows, cols = shadow.shape
+    for i in range(rows):
+        run = 0
+        for j in range(cols):
+            run = run + 1 if shadow[i, j] else 0
+            out[i, j] = run
+        run = 0
+        for j in range(cols - 1, -1, -1):
+            run = run + 1 if shadow[i, j] else 0
+            out[i, j] = min(out[i, j], run)
+
+
 def _before_shadow(
-    shadow: NDArray[np.bool_], echo: NDArray[np.bool_], beside: int, out: NDArray[np.bool_]
+    shadow: NDArray[np.bool_],
+    echo: NDArray[np.bool_],
+    beside: int,
+    info: ViewInfo,
+    out: NDArray[np.bool_],
 ) -> None:
     """Mark the pixels between the target's echo and its shadow: the target covers them.
 
     The shadow hides the seabed from the target's foot on. Between the foot and where the view turns
     dark lies the target's own echo: a bright edge towards the sonar, then often a top as faint as the
-    seabed. In each column, up-range of each stretch of shadow, all from the farthest echo (no farther than
-    the stretch is long) is left open; where no echo is seen, only the shadow's flank is.
+    seabed. In each column, up-range of each stretch of shadow, all from the farthest echo on the target is
+    left open; where no echo is seen, only the shadow's flank is.
+
+    A side along range, g long, is seen g/2 tan(w/2) to either side of its mean place by the looks of the
+    aperture w. A stretch that lies no farther inside of the shadow than that may be dark in some looks only,
+    and what is lit before it seabed beside the target. There g bounds what is left open, or the stretch's own
+    length where that is more.
 
     The echoes are those of as many rows, and of `beside` columns more on the left.
     """
     # An edge that glitters has dark columns in it: its neighbours speak for them.
-    edge = cv2.dilate(echo.astype(np.uint8), np.ones((1, 2 * _BESIDE + 1), np.uint8)).view(bool)
-    _mark_before(shadow, edge[:, beside : beside + shadow.shape[1]], _FLANK_PX, out)
+    edge = cv2.dilate(echo.astype(np.uint8), np.ones((1, 2 * BESIDE + 1), np.uint8)).view(bool)
+    inside = np.empty(shadow.shape, np.int32)
+    _columns_inside(shadow, inside)
+    row_m, col_m = info.camera.spacing_m
+    rows_a_column = 2.0 * col_m / (row_m * max(math.tan(info.aperture_rad / 2.0), 1e-4))
+    own = np.ascontiguousarray(edge[:, beside : beside + shadow.shape[1]])
+    _mark_before(np.ascontiguousarray(shadow), own, inside, rows_a_column, FLANK_PX, out)
 
 
 def silhouette_found(mask: View) -> bool:

@@ -24,7 +24,6 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
-from ..core.carving import MASK_COVERED, MASK_SHADOW, MASK_UNKNOWN
 from ..core.errors import CsasError
 from ..core.geometry import (
     TWO_PI,
@@ -32,6 +31,7 @@ from ..core.geometry import (
     View,
     unit_to_sonar,
 )
+from ..core.masks import MASK_COVERED, MASK_SHADOW, MASK_UNKNOWN
 from ..core.mesh import surface_field
 from ..core.shadow import enhance
 from ..core.subaperture import Spectrum, SubApertures

@@ -11,8 +11,9 @@ from core_data import make_info
 from hypothesis import given
 from hypothesis import strategies as st
 
-from csas_shadow_ros.core.carving import MASK_SHADOW, MASK_UNKNOWN, Carver
+from csas_shadow_ros.core.carving import Carver
 from csas_shadow_ros.core.geometry import Track, View, down_range_axis
+from csas_shadow_ros.core.masks import MASK_SHADOW, MASK_UNKNOWN
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.pipeline import run
 from csas_shadow_ros.core.seabed import SeabedSlope, ShadowEnd, seabed_slope, shadow_end
