@@ -30,6 +30,7 @@ CORE = [
     "ducc0>=0.34",
     "matplotlib>=3.6.3",
     "tqdm>=4.66",
+    "lazy_loader>=0.4",
     "PyYAML>=6.0",
     "mcap>=1.2",
     "zstandard>=0.22",
@@ -50,6 +51,9 @@ TEST = ["pytest>=7.4.4", "pytest-xdist>=3.4", "hypothesis>=6.98", "ruff~=0.17.6"
 TEST += ["packaging>=23"]
 # The viewer's page is tested in Debian's chromium; no browser is downloaded.
 TEST += ["playwright>=1.49,<2"]
+# Results as labelled arrays.
+XARRAY = ["xarray>=2023.1"]
+TEST += XARRAY
 # The benchmark compares with the fastest FFT library that can be had: a floor to measure against.
 BENCH = ["pyfftw>=0.14"]
 # setuptools 80 dropped what colcon's --symlink-install calls.
@@ -117,7 +121,7 @@ setup(
     ],
     packages=find_packages(include=[f"{NAME}*", "msg_adapters*"]),
     package_data={
-        NAME: ["py.typed", "**/*.html", "**/*.js", "**/*.css", "**/*.svg", "**/*.xml", "**/*.yaml"],
+        NAME: ["py.typed", "*.pyi", "**/*.html", "**/*.js", "**/*.css", "**/*.svg", "**/*.xml", "**/*.yaml"],
         "msg_adapters": ["py.typed"],
     },
     data_files=[
@@ -128,7 +132,14 @@ setup(
         *node_scripts(),
     ],
     install_requires=CORE,
-    extras_require={"ros": ROS, "test": TEST, "bench": BENCH, "build": BUILD, "dev": TEST + BUILD},
+    extras_require={
+        "ros": ROS,
+        "xarray": XARRAY,
+        "test": TEST,
+        "bench": BENCH,
+        "build": BUILD,
+        "dev": TEST + BUILD,
+    },
     entry_points={
         "console_scripts": [
             "csas-shadow = csas_shadow_ros.__main__:main",

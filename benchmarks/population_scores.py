@@ -19,7 +19,7 @@ from csas_shadow_ros.core.errors import CsasError
 from csas_shadow_ros.core.mesh import measure
 from csas_shadow_ros.core.pipeline import Result, run
 from csas_shadow_ros.core.volume import Volume, VoxelGrid
-from csas_shadow_ros.process import refuse_contradictions
+from csas_shadow_ros.from_bag import refuse_contradictions
 from csas_shadow_ros.simulation import SimulatedRun, iou, shadow_hull, voxelise_truth
 
 SIZES = ("length_m", "width_m", "height_m")

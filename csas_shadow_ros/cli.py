@@ -84,15 +84,9 @@ class Console:
     @contextlib.contextmanager
     def bar(self, what: str) -> Iterator[Callable[[int, int], None]]:
         """Give a function of (done, total) that moves a bar; none unless stderr is a terminal."""
-        from tqdm import tqdm
+        from .progress import progress_bar
 
-        hidden = self.quiet or not sys.stderr.isatty()
-        with tqdm(desc=what, unit="", file=sys.stderr, disable=hidden, leave=False) as bar:
-
-            def move(done: int, total: int) -> None:
-                bar.total = total
-                bar.update(done - bar.n)
-
+        with progress_bar(False if self.quiet else None, what) as move:
             yield move
 
 
@@ -165,13 +159,9 @@ def parameters_of(arguments: argparse.Namespace) -> PipelineParameters:
     ParameterError
         If one is unknown or out of range.
     """
-    from .parameter_file import pipeline_parameters, read_parameter_file
+    from .public import parameters
 
-    values = read_parameter_file(arguments.params) if arguments.params else {}
-    values.update(given_parameters(arguments))
-    if "position_m" in values and "target" not in values:
-        values["target"] = "given"  # a position is given for no other purpose
-    return pipeline_parameters(values)
+    return parameters(arguments.params, **given_parameters(arguments))
 
 
 def _run_option(parser: argparse.ArgumentParser, *, each: bool = False) -> None:

@@ -5,34 +5,30 @@ from __future__ import annotations
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from msg_adapters.topics import absolute_name, stream
-
 from .bags import BagReader, Problem, Run, read_run
-from .bags.check import ERROR, judge_amplitude, judge_coverage, judge_image, judge_sectors
 from .bags.metadata import read_metadata
 from .core.arcs import Arc, Arcs
-from .core.errors import BagError, CsasError, ParameterError, SpectrumSignError
-from .core.geometry import CoherentImage, Track, View, looks_at
-from .core.parameters import MAX_OBJECTS, START_FROM, PipelineParameters
-from .core.pipeline import Result
-from .core.pipeline import run as run_pipeline
-from .core.search.decision import Decision, decide_by_views
-from .core.stages import STAGES, run_views, with_spectrum_sign
+from .core.errors import BagError, CsasError
+from .core.geometry import CoherentImage, Track
+from .core.parameters import MAX_OBJECTS, PipelineParameters
+from .core.stages import STAGES
+from .from_bag import (
+    Notice,
+    Progress,
+    Source,
+    choose_start,
+    ignore,
+    reconstruct_run,
+    refuse_contradictions,
+    tell_of_sectors,
+)
 from .results import Context, ResultsWriter
-
-Progress = Callable[[int, int], None]
-Notice = Callable[[str], None]
-
-
-def _ignore(_: str) -> None:
-    return None
 
 
 def process_bag(
@@ -52,7 +48,7 @@ def process_bag(
     max_objects: int = MAX_OBJECTS,
     command: Sequence[str] = (),
     progress: Progress | None = None,
-    notice: Notice = _ignore,
+    notice: Notice = ignore,
 ) -> dict[str, Any]:
     """Reconstruct what a bag shows and write its results folder.
 
@@ -102,14 +98,27 @@ def process_bag(
     ) as writer:
         began = time.perf_counter()
         run = read_run(bag, namespace, run_of_bag)
-        stage = choose_start(run, start_from)
-        context = Context(p, command, stage=stage, spectrum_sign_override=spectrum_sign)
+        context = Context(p, command, spectrum_sign_override=spectrum_sign)
         context.read_truth(bag)
-        context.timings_s["read"] = time.perf_counter() - began
-        if stage == "image":
-            result = _from_image(run, context, writer, workers, max_objects, progress, notice)
-        else:
-            result = _from_views(run, context, writer, workers, max_objects, progress, notice)
+
+        def take_source(source: Source) -> None:
+            context.stage, context.image, context.track = source.stage, source.image, source.track
+            context.timings_s["read"] = time.perf_counter() - began
+            reader = BagReader(run.path, run.namespace) if source.as_recorded else None
+            writer.write_source(source.image, source.track, reader)
+
+        result = reconstruct_run(
+            run,
+            p,
+            start_from=start_from,
+            spectrum_sign=spectrum_sign,
+            workers=workers,
+            max_objects=max_objects,
+            on_source=take_source,
+            on_view=writer.add_view,
+            progress=progress,
+            notice=notice,
+        )
         context.timings_s["write_views"] = writer.view_seconds
         result.timings_s["views"] = max(result.timings_s.get("views", 0.0) - writer.view_seconds, 0.0)
         context.problems = told_once(run.problems)
@@ -135,7 +144,7 @@ def replay_bag(
     durable: bool = True,
     command: Sequence[str] = (),
     progress: Progress | None = None,
-    notice: Notice = _ignore,
+    notice: Notice = ignore,
 ) -> dict[str, Any]:
     """Reconstruct the target of a bag through the node graph and write the same results folder.
 
@@ -220,206 +229,6 @@ def replay_bag(
         context.describe(lambda: describe_run(run))
         report = writer.finish(result, context)
         return report | {"not_recorded": replayed.not_recorded} if write_bag else report
-
-
-def choose_start(run: Run, start_from: str = "auto") -> str:
-    """Say what a run starts from: ``image`` or one of the stages.
-
-    Raises
-    ------
-    BagError
-        If the bag does not hold it, or holds nothing to start from.
-    ParameterError
-        If `start_from` is unknown.
-    """
-    if start_from not in START_FROM:
-        raise ParameterError(f"start_from is {start_from!r}; expected one of: {', '.join(START_FROM)}")
-    has_image = run.image is not None or bool(run.counts.get("sector"))
-    stages = [stage for stage in STAGES if run.counts.get(stage)]
-    if start_from == "auto":
-        if has_image and run.track is not None:
-            return "image"
-        if stages:
-            return stages[0]
-        if not has_image:
-            run.coherent_image()  # raises, naming what is wrong with the image
-        run.require_track()
-    if start_from != "image" and start_from not in stages:
-        held = ", ".join(stages) or "none"
-        raise BagError(f"{run.path} holds no {start_from} views; stages that it holds: {held}")
-    return start_from
-
-
-def _from_image(
-    run: Run,
-    context: Context,
-    writer: ResultsWriter,
-    workers: int,
-    max_objects: int,
-    progress: Progress | None,
-    notice: Notice,
-) -> Result:
-    began = time.perf_counter()
-    image, track = run.coherent_image(), run.require_track()
-    refuse_contradictions(image, track, notice, run)
-    if run.image is None:
-        tell_of_sectors(run, notice)
-    context.timings_s["read"] += time.perf_counter() - began
-    sign = context.spectrum_sign_override
-    if sign is not None:
-        notice(
-            f"spectrum sign overridden: the bag states {image.acoustics.spectrum_sign:+d}, {sign:+d} is used"
-        )
-        image = replace(image, acoustics=replace(image.acoustics, spectrum_sign=sign))
-    context.image, context.track = image, track
-    as_recorded = sign is None and run.image is not None
-    writer.write_source(image, track, BagReader(run.path, run.namespace) if as_recorded else None)
-    try:
-        result = run_pipeline(
-            image,
-            track,
-            context.parameters,
-            progress=progress,
-            on_view=writer.add_view,
-            workers=workers,
-            max_objects=max_objects,
-            spectrum=None if run.image is not None else run.sector_sum().spectrum,
-            run_ns=run.run_ns,
-        )
-    except SpectrumSignError as error:
-        raise SpectrumSignError(
-            f"{error}; correct camera_info.d[3], or run with --spectrum-sign"
-            f" {-image.acoustics.spectrum_sign:+d}"
-        ) from error
-    if result.composites is None and result.rejected:
-        # Nothing was looked at: that is no finding that there is no object.
-        raise BagError(
-            f"{run.path}: none of {len(result.rejected)} views could be made:"
-            f" {next(iter(result.rejected.values()))}"
-        )
-    return result
-
-
-def _from_views(
-    run: Run,
-    context: Context,
-    writer: ResultsWriter,
-    workers: int,
-    max_objects: int,
-    progress: Progress | None,
-    notice: Notice,
-) -> Result:
-    stage, sign = context.stage, context.spectrum_sign_override
-    context.track = run.track
-    notice(f"starting from the bag's {stage} views ({run.counts[stage]})")
-    if sign is not None:
-        notice(f"spectrum sign of the views overridden: {sign:+d} is used")
-    writer.write_source(None, run.track)
-
-    warned: set[str] = set()
-
-    def views() -> Iterator[View]:
-        usable = False
-        for view in run.views(stage):
-            usable = True
-            for _, problem, remedy in judge_amplitude(view) if stage == "shadow" else ():
-                if not warned:
-                    notice(f"warning: view stamped {view.info.stamp_ns} ns: {problem}. {remedy}")
-                    warned.add(problem)
-            yield view if sign is None else with_spectrum_sign(view, sign)
-        if not usable:
-            raise BagError(run.why(f"none of the {run.counts[stage]} {stage} views is usable"))
-
-    decision = decision_of_views(run, stage, context.parameters, max_objects, views)
-    return run_views(
-        views,
-        stage,
-        context.parameters,
-        decision=decision,
-        sub_apertures=(lambda: run.views("sub_aperture")) if run.counts.get("sub_aperture") else None,
-        run_ns=run.run_ns,
-        total=run.counts[stage],
-        progress=progress,
-        on_view=writer.add_view,
-        workers=workers,
-    )
-
-
-def decision_of_views(
-    run: Run,
-    stage: str,
-    parameters: PipelineParameters,
-    max_objects: int,
-    views: Callable[[], Iterator[View]] | None = None,
-) -> Decision:
-    """Say what is carved of a bag's views: what they were made for, where the bag tells, or what they show.
-
-    Parameters
-    ----------
-    run : Run
-        The bag.
-    stage : str
-        What its views are.
-    parameters : PipelineParameters
-        A target that is given there comes first.
-    max_objects : int
-        At most so many bodies are carved.
-    views : callable, optional
-        Gives the views, if not as they are in the bag.
-
-    Raises
-    ------
-    CsasError
-        See `core.search.decision.decide_by_views`.
-    """
-    each = views or (lambda: run.views(stage))
-    recorded = run.decision() if parameters.target.target == "auto" else None
-    if recorded is not None and recorded.target is not None:
-        first = next(iter(each()), None)
-        if first is not None and looks_at(first.info, recorded.target.position_m):
-            if stage != "sub_aperture" and not run.counts.get("sub_aperture"):
-                return replace(recorded, others=())
-            return recorded
-    return decide_by_views(each, stage, parameters.target, max_objects)
-
-
-def refuse_contradictions(
-    image: CoherentImage, track: Track, notice: Notice = _ignore, run: Run | None = None
-) -> None:
-    """Refuse an image, band and track that cannot belong together: "no object" would be a false answer.
-
-    Parameters
-    ----------
-    image : CoherentImage
-        The image, with its band.
-    track : Track
-        The track.
-    notice : callable
-        Called with each doubt that is no reason to refuse.
-    run : Run, optional
-        Takes each such doubt as a problem, for the report.
-
-    Raises
-    ------
-    BagError
-        With what is wrong and what to do about it.
-    """
-    judged = [("track", found) for found in judge_coverage(track)]
-    judged += [("image", found) for found in judge_image(image, track)]
-    for relative, (level, problem, remedy) in judged:
-        if level == ERROR:
-            raise BagError(f"{problem}. {remedy}")
-        notice(f"{level}: {problem}. {remedy}")
-        if run is not None:
-            run.report(Problem(absolute_name(relative, run.namespace), None, None, problem))
-
-
-def tell_of_sectors(run: Run, notice: Notice = _ignore) -> None:
-    """Tell of arcs that no sector covers, or two: as it goes, and in the report's problems."""
-    topic = absolute_name(stream("sector").image_topic, run.namespace)
-    for level, problem, remedy in judge_sectors(run, run.require_track()):
-        notice(f"{level}: {problem}. {remedy}")
-        run.report(Problem(topic, None, None, problem))
 
 
 def told_once(problems: Sequence[Problem]) -> list[str]:
@@ -536,7 +345,7 @@ def topic_sizes(run: Run) -> dict[str, int]:
 
 def stages_of(run: Run) -> list[str]:
     """Return what a run of this bag could start from."""
-    found = []
+    found: list[str] = []
     try:
         found.append(choose_start(run))
     except CsasError:

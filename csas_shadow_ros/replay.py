@@ -484,7 +484,7 @@ def _plan(bag: str | Path, stage: str, p: PipelineParameters) -> tuple[str, Deci
     if chosen in ("image", "sector"):
         return chosen, None
     from .core.stages import check_method
-    from .process import decision_of_views
+    from .from_bag import decision_of_views
 
     check_method(chosen, p)
     decision = decision_of_views(read_run(bag), chosen, p, 1)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from csas_shadow_ros.core.errors import BagError, CsasError
+import numpy as np
+
+from csas_shadow_ros.core.errors import BagError, CsasError, check_type
 from csas_shadow_ros.core.geometry import CoherentImage, Track, View
 from csas_shadow_ros.core.sector import Sector, unlike
 from msg_adapters.camera_info import SectorInfo, sector_info_from_msg
@@ -41,6 +44,9 @@ if TYPE_CHECKING:
     from csas_shadow_ros.core.streaming import SectorSum
 
 T = TypeVar("T")
+
+#: Where a run is that is in no bag.
+IN_MEMORY = Path("in memory")
 
 
 @dataclass
@@ -82,6 +88,44 @@ class Run:
     _reader: BagReader | None = None
     _sum: SectorSum | None = None
     _infos: list[SectorInfo] | None = None
+
+    @classmethod
+    def of(cls, image: CoherentImage, track: Track) -> Run:
+        """Make a run of an image and a track that are in memory, without a bag.
+
+        Parameters
+        ----------
+        image : CoherentImage
+            The full-circle image.
+        track : Track
+            Where the sonar was.
+
+        Examples
+        --------
+        >>> import csas_shadow_ros as csas
+        >>> made = csas.simulate("tiny")
+        >>> csas.Run.of(made.image, made.track)
+        Run in memory: image, track
+          CoherentImage: 512 × 512 pixels (complex64) of 0.005 m, ...
+          Track: 720 poses over 360.0° of the circle, radius 30.00 m, height 12.00 m, 0 gaps
+        """
+        check_type("image", image, CoherentImage, "a CoherentImage")
+        check_type("track", track, Track, "a Track")
+        name = int(track.stamps_ns[0])
+        return cls(IN_MEMORY, NAMESPACE, image, track, {"image": 1}, run_ns=name, run_names=(name,))
+
+    def __repr__(self) -> str:
+        where = "in memory" if self.path is IN_MEMORY else f"of {self.path}"
+        held = ["image" if name == "image" else f"{n} {name}" for name, n in self.counts.items()]
+        held += ["track"] if self.track is not None else []
+        lines = [f"Run {where}: {', '.join(held) or 'nothing to start from'}"]
+        lines += [f"  {part}".replace("\n", "\n  ") for part in (self.image, self.track) if part is not None]
+        if len(self.run_names) > 1:
+            lines.append(f"  one of {len(self.run_names)} runs")
+        if self.problems:
+            more = f" (and {len(self.problems) - 1} more)" if len(self.problems) > 1 else ""
+            lines.append(f"  problem: {self.problems[0]}{more}")
+        return "\n".join(lines)
 
     def views(self, stream_name: str) -> Iterator[View]:
         """Iterate the views of a stage: `sub_aperture`, `shadow`, `likelihood` or `shadow_mask`.
@@ -270,7 +314,20 @@ def read_run(path: str | Path, namespace: str | None = None, run: int | None = N
     ------
     BagError
         If there is no bag to read, or it has no such run.
+    InputTypeError
+        If the path is none, or the run no whole number.
+
+    Examples
+    --------
+    >>> import csas_shadow_ros as csas
+    >>> csas.read_run("box_run")
+    Run of box_run: image, track
+      CoherentImage: 512 × 512 pixels (complex64) of 0.005 m, x -1.28 to 1.28 m, y -1.28 to 1.28 m
+        60 kHz, bandwidth 24 kHz, sound speed 1500 m/s, spectrum sign +1
+      Track: 720 poses over 360.0° of the circle, radius 30.00 m, height 12.00 m, 0 gaps
     """
+    check_type("path", path, (str, os.PathLike), "the path of a bag")
+    check_type("run", run, (int, np.integer, type(None)), "a number or a name (ns) of a run")
     reader = BagReader(path, namespace)
     found = {name: reader.topic(s.image_topic) for name, s in STREAMS.items()}
     counts = {name: info.count for name, info in found.items() if info is not None and info.count}

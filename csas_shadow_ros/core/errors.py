@@ -23,11 +23,15 @@ class ViewError(CsasError, ValueError):
     """One view cannot be used; the run goes on without it."""
 
 
-class NoTargetError(CsasError):
+class InputTypeError(CsasError, TypeError):
+    """An argument is of the wrong kind; the message gives its name, its kind and what was expected."""
+
+
+class NoTargetError(CsasError, ValueError):
     """A target was needed and neither given nor found."""
 
 
-class SpectrumSignError(CsasError):
+class SpectrumSignError(CsasError, ValueError):
     """The image contradicts its stated spectrum sign: its shadows fall towards the sonar."""
 
 
@@ -35,8 +39,35 @@ class AdapterError(CsasError, ValueError):
     """A message breaks the contract; the error names the field, the value and what was expected."""
 
 
-class BagError(CsasError):
+class BagError(CsasError, ValueError):
     """A bag cannot be read or does not honour the contract."""
+
+
+class MissingExtraError(CsasError, ImportError):
+    """A library that only one function needs is not installed; the message names the extra that brings it."""
+
+
+def check_type(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
+    """Raise unless an argument is of a kind.
+
+    Parameters
+    ----------
+    name : str
+        What the value is, for the message.
+    value : object
+        The value.
+    kind : type or tuple of type
+        What it may be.
+    expected : str
+        The same in words.
+
+    Raises
+    ------
+    InputTypeError
+        If it is something else.
+    """
+    if not isinstance(value, kind):
+        raise InputTypeError(f"{name} is a {type(value).__name__}; expected {expected}")
 
 
 def check_range(

@@ -229,6 +229,13 @@ class Dimensions:
     hull_top_m: float = math.nan
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        x, y = self.position_m
+        return (
+            f"{self.length_m:.3f} × {self.width_m:.3f} × {self.height_m:.3f} m, {self.volume_m3:.4f} m³,"
+            f" heading {math.degrees(self.heading_rad):.1f}°, at x {x:.3f}, y {y:.3f} m"
+        )
+
     def rounded(self, voxel_size_m: float) -> Dimensions:
         """Return the measures without digits that say nothing.
 

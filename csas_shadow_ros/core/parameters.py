@@ -10,11 +10,24 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 from .errors import ParameterError
 
 T = TypeVar("T")
+
+#: Kinds of views, first to last.
+Stage = Literal["sub_aperture", "shadow", "likelihood", "shadow_mask"]
+#: What a run may start from.
+StartFrom = Literal["auto", "image", "sub_aperture", "shadow", "likelihood", "shadow_mask"]
+
+# Choices of parameters: type checkers and editors know them, and `get_args` gives them to the checks.
+Taper = Literal["none", "tukey", "taylor"]
+Enhancement = Literal["exact", "small_angle", "none"]
+Background = Literal["local", "global"]
+ShadowLevel = Literal["estimated", "contrast"]
+Method = Literal["consensus", "hard", "soft"]
+TargetChoice = Literal["auto", "given"]
 
 
 def bounded(
@@ -113,8 +126,8 @@ class SubApertureParameters(Parameters):
 
     aperture_deg: float = bounded(12.0, "full width of a sub-aperture", low=0.5, high=90.0, unit="deg")
     step_deg: float = bounded(1.0, "aspect step between views; divides 360", low=0.1, high=90.0, unit="deg")
-    taper: str = bounded(
-        "none", "window over the aperture ('none' is the paper's)", choices=("none", "tukey", "taylor")
+    taper: Taper = bounded(
+        "none", "window over the aperture ('none' is the paper's)", choices=get_args(Taper)
     )
     oversampling: float = bounded(
         1.5, "view pixels per resolution cell of the wedge's bandwidth", low=1.0, high=8.0
@@ -135,10 +148,8 @@ class SubApertureParameters(Parameters):
 class ShadowParameters(Parameters):
     """Shadow enhancement, FFSE (section 3.2)."""
 
-    enhancement: str = bounded(
-        "exact",
-        "filter: exact, the paper's simplified one, or none",
-        choices=("exact", "small_angle", "none"),
+    enhancement: Enhancement = bounded(
+        "exact", "filter: exact, the paper's simplified one, or none", choices=get_args(Enhancement)
     )
 
 
@@ -146,11 +157,11 @@ class ShadowParameters(Parameters):
 class LikelihoodParameters(Parameters):
     """Likelihood of a pixel being outside the shadow (section 4.2) and shadow segmentation."""
 
-    background: str = bounded(
-        "local", "seabed level: one a view, or a smooth surface", choices=("local", "global")
+    background: Background = bounded(
+        "local", "seabed level: one a view, or a smooth surface", choices=get_args(Background)
     )
-    shadow_level: str = bounded(
-        "estimated", "shadow level: measured, or from the contrast", choices=("estimated", "contrast")
+    shadow_level: ShadowLevel = bounded(
+        "estimated", "shadow level: measured, or from the contrast", choices=get_args(ShadowLevel)
     )
     shadow_contrast_db: float = bounded(
         12.0, "seabed over shadow level; start of the estimate", low=1.0, high=60.0, unit="dB"
@@ -172,10 +183,10 @@ class LikelihoodParameters(Parameters):
 class CarvingParameters(Parameters):
     """Space carving (section 4)."""
 
-    method: str = bounded(
+    method: Method = bounded(
         "consensus",
         "consensus: silhouettes, few views may contradict; hard: none may; soft: mean likelihood",
-        choices=("consensus", "hard", "soft"),
+        choices=get_args(Method),
     )
     voxel_size_m: float = bounded(0.02, "edge of a voxel", low=1e-4, high=1e3, unit="m")
     threshold: float = bounded(
@@ -206,7 +217,9 @@ class CarvingParameters(Parameters):
 class TargetParameters(Parameters):
     """Where the target is and how large a volume is carved."""
 
-    target: str = bounded("auto", "auto: find it; given: at position_m", choices=("auto", "given"))
+    target: TargetChoice = bounded(
+        "auto", "auto: find it; given: at position_m", choices=get_args(TargetChoice)
+    )
     position_m: tuple[float, ...] = bounded(
         (0.0, 0.0), "x, y of the target when given", low=-1e6, high=1e6, unit="m", length=2
     )
@@ -221,9 +234,9 @@ class TargetParameters(Parameters):
 
 
 #: Stages whose views a run can start from, first to last.
-VIEW_STAGES = ("sub_aperture", "shadow", "likelihood", "shadow_mask")
+VIEW_STAGES: tuple[Stage, ...] = get_args(Stage)
 #: What a run can start from; auto takes the first that the bag holds.
-START_FROM = ("auto", "image", *VIEW_STAGES)
+START_FROM: tuple[StartFrom, ...] = get_args(StartFrom)
 
 STAGES: dict[str, type[Parameters]] = {
     "sub_aperture": SubApertureParameters,

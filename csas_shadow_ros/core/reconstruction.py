@@ -25,7 +25,7 @@ from .errors import ViewError
 from .geometry import View, ViewInfo
 from .hollows import EchoLook, matter_mesh, matter_of
 from .likelihood import Levels
-from .masks import KeptMask
+from .masks import MASK_SHADOW, KeptMask
 from .measurement import SilhouetteSides, levels_of_mask, measure_object, shadow_height, silhouette_sides
 from .mesh import Dimensions, measure, mesh_from_grid
 from .parameters import PipelineParameters
@@ -207,6 +207,7 @@ class Reconstruction:
         #: How many views there will be at most; 0: nobody knows.
         self.most_views = 0
         self._compose = compose
+        self._best: tuple[int, View | None] = (-1, None)
 
     @property
     def stamps(self) -> set[int]:
@@ -295,12 +296,21 @@ class Reconstruction:
                 self.refuse(aspect, str(made))
             else:
                 self._take(made, aspect)
-                if on_view and self.bodies and not isinstance(made[0], ViewError):
-                    on_view(made[0])
+                if self.bodies and not isinstance(made[0], ViewError):
+                    self._keep_best(made[0])
+                    if on_view:
+                        on_view(made[0])
             if progress:
                 progress(done, max(total, done))
         self.timings_s["views"] = time.perf_counter() - began
         return done
+
+    def _keep_best(self, view: ProcessedView) -> None:
+        """Keep the view in which the target's shadow covers the most ground."""
+        shown = view.shadow or view.likelihood or view.mask
+        shadow = 0 if view.mask is None else int(np.count_nonzero(view.mask.pixels == MASK_SHADOW))
+        if shown is not None and shadow > self._best[0]:
+            self._best = (shadow, shown)
 
     def _made_or_not(self, number: int, view: ProcessedView) -> ProcessedView | ViewError:
         try:
@@ -363,6 +373,7 @@ class Reconstruction:
             rejected=dict(self.rejected),
             left_out=list(self.decision.left_out),
             timings_s=dict(self.timings_s),
+            best_shadow=self._best[1],
         )
         if self.stamps:
             body = self.bodies[0]

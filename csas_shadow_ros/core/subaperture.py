@@ -408,6 +408,12 @@ class SubApertures:
         #: Side of the square views (pixels).
         self.size = max(2, math.ceil(side / self.spacing_m))
 
+    def __repr__(self) -> str:
+        return (
+            f"SubApertures: {len(self.aspects_rad)} views, aperture {math.degrees(self.aperture_rad):g}°,"
+            f" each {self.size} × {self.size} pixels of {self.spacing_m:.4g} m"
+        )
+
     def __len__(self) -> int:
         return len(self.aspects_rad)
 

@@ -154,3 +154,14 @@ class VoxelGrid:
     occupied: NDArray[np.bool_]
     method: str = "consensus"
     seabed: SeabedSlope | None = None
+
+    def __repr__(self) -> str:
+        nz, ny, nx = self.volume.shape
+        x, y, z = self.volume.size_m
+        return (
+            f"VoxelGrid: {nx} × {ny} × {nz} voxels (x, y, z) of {self.volume.voxel_size_m:g} m"
+            f" = {x:.2f} × {y:.2f} × {z:.2f} m\n"
+            f"  {self.method}, threshold {self.threshold:.3g},"
+            f" {int(np.count_nonzero(self.occupied))} occupied,"
+            f" {int(np.count_nonzero(~np.isfinite(self.likelihood)))} unknown"
+        )

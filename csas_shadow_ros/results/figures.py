@@ -34,6 +34,7 @@ from ..core.geometry import (
 from ..core.masks import MASK_COVERED, MASK_SHADOW, MASK_UNKNOWN
 from ..core.mesh import surface_field
 from ..core.shadow import enhance
+from ..core.shape.picture import view_extent
 from ..core.subaperture import Spectrum, SubApertures
 from ..core.volume import VoxelGrid
 from .subject import SIX_ASPECTS_DEG, ProcessedView, Subject
@@ -383,24 +384,11 @@ def _around_target(subject: Subject, view: View) -> tuple[float, float, float, f
     return -across, across, -0.8 * across, length + across
 
 
-def _view_extent(view: View, target_m: tuple[float, float]) -> tuple[float, float, float, float]:
-    """Return matplotlib's extent of a view, cross-range and down-range from the target (m)."""
-    camera = view.info.camera
-    rows_m, cols_m = camera.spacing_m
-    u, v, _ = camera.ground_to_pixel @ np.array([target_m[0], target_m[1], 1.0])
-    return (
-        (-0.5 - u) * cols_m,
-        (camera.cols - 0.5 - u) * cols_m,
-        (camera.rows - 0.5 - v) * rows_m,
-        (-0.5 - v) * rows_m,
-    )
-
-
 def _show_view(axes: Any, subject: Subject, view: View, pixels: Any, title: str, **style: Any) -> Any:
     target = subject.result.target
     if target is None:
         raise _Missing("there is no target, so no shadow to look at")
-    shown = axes.imshow(pixels, extent=_view_extent(view, target.position_m), **style)
+    shown = axes.imshow(pixels, extent=view_extent(view, target.position_m), **style)
     left, right, near, far = _around_target(subject, view)
     axes.set_xlim(left, right)
     axes.set_ylim(far, near)  # the sonar is above the picture

@@ -202,7 +202,9 @@ def _sensitivity(grid: VoxelGrid | None, parameters: CarvingParameters) -> list[
     curve = []
     for factor in _SENSITIVITY:
         threshold = min(1.0, factor * grid.threshold)
-        chosen = dataclasses.replace(parameters, method=grid.method, threshold=threshold)
+        chosen = CarvingParameters.from_mapping(
+            {**dataclasses.asdict(parameters), "method": grid.method, "threshold": threshold}
+        )
         occupied = thresholded(grid.volume, grid.likelihood, grid.views, chosen).occupied
         layers = np.flatnonzero(occupied.any(axis=(1, 2)))
         d = grid.volume.voxel_size_m

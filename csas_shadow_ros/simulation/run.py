@@ -42,13 +42,13 @@ from numpy.typing import NDArray
 from ..core.errors import ParameterError, check_range
 from ..core.geometry import TWO_PI, Acoustics, CoherentImage, Track
 from ..core.solid import apart
+from ..progress import ProgressOption, progress_bar
 from .profiles import Faults, Profile, get_profile
 from .scene import SceneModel
 from .seabed import Seabed, SeabedModel
 from .targets import Scene, make_scene
 
 FloatArray = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 
 EPOCH_NS = 1_700_000_000_000_000_000
 _NUFFT_EPSILON = 1e-5
@@ -93,6 +93,14 @@ class Truth:
     faults: Faults
     acoustics: Acoustics
     sonar_m: FloatArray
+
+    def __repr__(self) -> str:
+        size = " × ".join(f"{side:.3f}" for side in self.dims_m)
+        x, y = self.position_m
+        return (
+            f"Truth: {self.name}, {size} m, heading {math.degrees(self.heading_rad):.1f}°,"
+            f" at x {x:.3f}, y {y:.3f} m, seed {self.seed}"
+        )
 
     def save(self, path: str | Path) -> tuple[Path, Path]:
         """Write ``<path>.truth.stl`` and ``<path>.truth.json``.
@@ -156,6 +164,10 @@ class SimulatedRun:
     image: CoherentImage
     track: Track
     truth: Truth
+
+    def __repr__(self) -> str:
+        parts = (repr(part).replace("\n", "\n  ") for part in (self.image, self.track, self.truth))
+        return "\n  ".join(("SimulatedRun:", *parts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -425,7 +437,7 @@ def simulate(
     clockwise: bool = False,
     start_aspect_deg: float = 0.0,
     workers: int | None = None,
-    progress: Progress | None = None,
+    progress: ProgressOption = None,
 ) -> SimulatedRun:
     """Simulate a circular SAS run over a target on a rough seabed.
 
@@ -455,8 +467,9 @@ def simulate(
         Aspect of the first pose.
     workers : int, optional
         Threads; all processors by default. Does not change the result.
-    progress : callable, optional
-        Called with (blocks done, blocks) from this thread.
+    progress : callable or bool, optional
+        Called with (blocks done, blocks) from this thread. A bar in a terminal or a notebook by default;
+        False: none.
 
     Returns
     -------
@@ -467,6 +480,16 @@ def simulate(
     ------
     ParameterError, GeometryError
         If an argument is out of range or a mesh is not usable.
+
+    Examples
+    --------
+    >>> import csas_shadow_ros as csas
+    >>> csas.simulate("tiny", "cylinder", heading_deg=30.0)
+    SimulatedRun:
+      CoherentImage: 512 × 512 pixels (complex64) of 0.005 m, x -1.28 to 1.28 m, y -1.28 to 1.28 m
+        60 kHz, bandwidth 24 kHz, sound speed 1500 m/s, spectrum sign +1
+      Track: 720 poses over 360.0° of the circle, radius 30.00 m, height 12.00 m, 0 gaps
+      Truth: cylinder, ... m, heading 30.0°, at x 0.000, y 0.000 m, seed 0
     """
     profile = get_profile(profile)
     faults = faults if faults is not None else Faults()
@@ -530,10 +553,9 @@ def simulate(
         made = made * seabed_scale + noise[part] * kept
         spectrum[wedges.q[part], wedges.p[part]] = made  # negative indices count from the end
 
-    with ThreadPoolExecutor(max_workers=threads) as pool:
+    with progress_bar(progress, "blocks") as bar, ThreadPoolExecutor(max_workers=threads) as pool:
         for done, _ in enumerate(pool.map(work, range(blocks)), start=1):
-            if progress is not None:
-                progress(done, blocks)
+            bar(done, blocks)
     pixels = scipy.fft.ifft2(spectrum, norm="forward", overwrite_x=True, workers=threads)
     if spectrum_sign == -1:
         np.conjugate(pixels, out=pixels)

@@ -239,7 +239,7 @@ class ViewerServer:
             raise ParameterError(f"threshold is {text}; expected over 0, up to 1")
         if not text or math.isclose(threshold, grid.threshold, rel_tol=1e-6):
             return grid
-        p = CarvingParameters(method=grid.method, threshold=threshold)
+        p = CarvingParameters.from_mapping({"method": grid.method, "threshold": threshold})
         return thresholded(grid.volume, grid.likelihood, grid.views, p)
 
     async def _surface(self, request: web.Request) -> web.StreamResponse:

@@ -131,6 +131,13 @@ class Track:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    def __repr__(self) -> str:
+        _, _, radius, height = self.circle
+        return (
+            f"Track: {len(self)} poses over {math.degrees(self.coverage_rad):.1f}° of the circle,"
+            f" radius {radius:.2f} m, height {height:.2f} m, {len(self.gaps)} gaps"
+        )
+
     @cached_property
     def circle(self) -> tuple[float, float, float, float]:
         """Least-squares circle (centre x, centre y, radius, mean height), metres.

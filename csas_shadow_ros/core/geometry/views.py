@@ -86,6 +86,14 @@ class View:
                 f"view has {self.pixels.shape} pixels; its camera says {self.info.camera.shape} (rows, cols)"
             )
 
+    def __repr__(self) -> str:
+        (rows, cols), (down_m, cross_m) = self.pixels.shape, self.info.camera.spacing_m
+        return (
+            f"View from {math.degrees(self.info.aspect_rad) % 360.0:.1f}°,"
+            f" aperture {math.degrees(self.info.aperture_rad):.1f}°: {rows} × {cols} pixels"
+            f" ({self.pixels.dtype}) of {down_m:.4g} × {cross_m:.4g} m, stamp {self.info.stamp_ns} ns"
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class CoherentImage:
@@ -113,6 +121,16 @@ class CoherentImage:
             raise GeometryError(
                 f"image has {self.pixels.shape} pixels; its grid says {self.grid.shape} (rows, cols)"
             )
+
+    def __repr__(self) -> str:
+        (rows, cols), band = self.pixels.shape, self.acoustics
+        left, right, bottom, top = self.grid.extent_m
+        return (
+            f"CoherentImage: {rows} × {cols} pixels ({self.pixels.dtype}) of {self.grid.spacing_m:.4g} m,"
+            f" x {left:.2f} to {right:.2f} m, y {bottom:.2f} to {top:.2f} m\n"
+            f"  {band.centre_frequency_hz / 1e3:g} kHz, bandwidth {band.bandwidth_hz / 1e3:g} kHz,"
+            f" sound speed {band.sound_speed_mps:g} m/s, spectrum sign {band.spectrum_sign:+d}"
+        )
 
 
 def looks_at(info: ViewInfo, target_m: tuple[float, float]) -> bool:

@@ -14,8 +14,11 @@ from ..volume import Target, VoxelGrid
 
 if TYPE_CHECKING:
     import trimesh
+    import xarray
+    from matplotlib.figure import Figure
 
     from ..composites import Composites
+    from ..geometry import View
     from ..hollows import EchoLook
     from ..measurement import SilhouetteSides
     from ..search.decision import Decision
@@ -104,6 +107,9 @@ class ObjectResult:
     dimensions: Dimensions
     views_used: int
 
+    def __repr__(self) -> str:
+        return f"ObjectResult: {self.dimensions} ({self.views_used} views)"
+
 
 @dataclass(eq=False)
 class Result:
@@ -150,6 +156,9 @@ class Result:
         made the result; a result that was read from topics has none.
     looks : dict of EchoLook
         Where each view is dark round the target, by stamp: what hollows are told by. Kept likewise.
+    best_shadow : View or None
+        The view in which the target's shadow shows most: amplitude, or what the run started from. Kept
+        likewise, where all views were processed in one go.
     further : list of ObjectResult
         What else stands on the seabed, in the order of the search's evidence.
     left_out : list of LeftOut
@@ -179,6 +188,7 @@ class Result:
     evidence: dict[int, ViewEvidence] = field(default_factory=dict)
     sides: list[SilhouetteSides] = field(default_factory=list)
     looks: dict[int, EchoLook] = field(default_factory=dict)
+    best_shadow: View | None = None
     further: list[ObjectResult] = field(default_factory=list)
     left_out: list[LeftOut] = field(default_factory=list)
     timings_s: dict[str, float] = field(default_factory=dict)
@@ -190,3 +200,61 @@ class Result:
             return list(self.further)
         main = ObjectResult(self.target, self.grid, self.mesh, self.dimensions, self.views_used)
         return [main, *self.further]
+
+    def __repr__(self) -> str:
+        from .show import text  # late, as in the next ones: who only passes a result on draws nothing
+
+        return text(self)
+
+    def _repr_html_(self) -> str:
+        from .show import as_html
+
+        return as_html(self)
+
+    def plot(self) -> Figure:
+        """Draw the plan, the side, and the view with the most shadow (the sonar is above it).
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            A figure of its own, not one of pyplot's: a notebook shows it, `savefig` writes it.
+
+        Examples
+        --------
+        >>> import csas_shadow_ros as csas
+        >>> result = csas.reconstruct(csas.simulate("tiny"), csas.parameters(step_deg=15))
+        >>> figure = result.plot()
+        >>> figure.savefig("box.png")
+        """
+        from .picture import plot
+
+        return plot(self)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the target's grid as labelled arrays over z, y and x (m, scene frame).
+
+        Returns
+        -------
+        xarray.Dataset
+            ``likelihood``, ``views``, ``occupied`` and ``matter``; verdict, quality and dimensions are its
+            attributes. Without a grid it has these alone.
+
+        Raises
+        ------
+        MissingExtraError
+            If xarray is not installed: ``pip install 'csas_shadow_ros[xarray]'``.
+
+        Examples
+        --------
+        >>> import csas_shadow_ros as csas
+        >>> result = csas.reconstruct(csas.simulate("tiny"), csas.parameters(step_deg=15))
+        >>> grid = result.to_xarray()
+        >>> grid.occupied.dims
+        ('z', 'y', 'x')
+        >>> top = grid.occupied.any(["x", "y"])
+        >>> 0.2 < float(grid.z[top].max()) < 0.6
+        True
+        """
+        from .show import to_xarray
+
+        return to_xarray(self)
