@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import shutil
 import time
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ import numpy as np
 from .bags import BagReader, Problem, Run, read_run
 from .bags.metadata import read_metadata
 from .core.arcs import Arc, Arcs
-from .core.errors import BagError, CsasError
+from .core.errors import BagError, CsasError, check_type
 from .core.geometry import CoherentImage, Track
 from .core.parameters import MAX_OBJECTS, PipelineParameters
 from .core.stages import STAGES
@@ -91,7 +92,17 @@ def process_bag(
     ------
     CsasError
         If the bag, a parameter or the folder is not usable.
+
+    Examples
+    --------
+    >>> import csas_shadow_ros as csas
+    >>> chosen = csas.parameters(step_deg=15)
+    >>> report = csas.process_bag("box_run", "box_results", chosen, figures=False)
+    >>> report["verdict"]
+    'object'
     """
+    check_type("bag", bag, (str, os.PathLike), "the path of a bag")
+    check_type("out", out, (str, os.PathLike), "the path of a results folder")
     p = parameters or PipelineParameters()
     with ResultsWriter(
         out, overwrite=overwrite, bag=write_bag, figures=figures, durable=durable, notice=notice

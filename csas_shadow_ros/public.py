@@ -85,8 +85,8 @@ def reconstruct(
     >>> result = csas.reconstruct(run, csas.parameters(step_deg=15))
     >>> result
     Result: object, quality good
-      0.... × 0.... × 0.... m, 0.... m³, heading ...°, at x ..., y ... m
-      24 views used, 0 refused, 360° of the circle
+      0... × 0... × 0... m, 0... m³, heading ...°, at x ..., y ... m
+      24 views used, 0 refused, 288° of the circle
     >>> result.mesh.is_watertight
     True
     """

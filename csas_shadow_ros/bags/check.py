@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from csas_shadow_ros.core.errors import BagError, CsasError
+from csas_shadow_ros.core.errors import BagError, CsasError, check_type
 from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, Track, View
 from msg_adapters.camera_info import SectorInfo
 from msg_adapters.pairs import (
@@ -162,7 +163,20 @@ def check_bag(path: str | Path, namespace: str | None = None, run: int | None = 
     -------
     CheckReport
         Never raises for a bad bag: that is what the report is for.
+
+    Raises
+    ------
+    InputTypeError
+        If the path is none.
+
+    Examples
+    --------
+    >>> import csas_shadow_ros as csas
+    >>> report = csas.check_bag("box_run")
+    >>> report.ok
+    True
     """
+    check_type("path", path, (str, os.PathLike), "the path of a bag")
     report = CheckReport(str(path))
     try:
         reader = BagReader(path, namespace)

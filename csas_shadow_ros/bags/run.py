@@ -421,7 +421,19 @@ def write_run(
         If the path is taken or the encoding is unknown.
     AdapterError
         If something to be written breaks the contract.
+    InputTypeError
+        If the path, the image or the track is something else.
+
+    Examples
+    --------
+    >>> import csas_shadow_ros as csas
+    >>> run = csas.read_run("box_run")
+    >>> csas.write_run("smaller_run", run.image, run.track, encoding="8SC2").name
+    'smaller_run'
     """
+    check_type("path", path, (str, os.PathLike), "the path of a bag")
+    check_type("image", image, (CoherentImage, type(None)), "a CoherentImage or None")
+    check_type("track", track, (Track, type(None)), "a Track or None")
     if encoding not in COMPLEX_ENCODINGS:
         raise BagError(f"encoding is {encoding!r}; expected one of: {', '.join(COMPLEX_ENCODINGS)}")
     integers = encoding in ("8SC2", "16SC2")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ..core.errors import check_type
 from ..core.sector import Sector
 from .run import SimulatedRun, simulate
 from .sectors import sectors_of_run
@@ -43,7 +45,16 @@ def simulate_bag(
     ------
     CsasError
         If an argument is out of range, or the bag cannot be written.
+
+    Examples
+    --------
+    >>> import csas_shadow_ros as csas
+    >>> made = csas.simulate_bag("sector_run", "tiny", "cone", sectors_deg=30)
+    >>> csas.read_run("sector_run")
+    Run of sector_run: 12 sector, track
+      Track: 720 poses over 360.0° of the circle, radius 30.00 m, height 12.00 m, 0 gaps
     """
+    check_type("path", path, (str, os.PathLike), "the path of a bag")
     # Writing bags needs the message libraries; simulating does not.
     from ..bags import write_run
 

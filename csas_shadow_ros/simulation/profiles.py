@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from ..core.errors import ParameterError, check_range
+from ..core.errors import ParameterError, check_range, check_type
 from ..core.geometry import Acoustics, GroundGrid
 from ..core.parameters import Parameters, bounded
 
@@ -129,6 +129,7 @@ def get_profile(profile: str | Profile, **overrides: Any) -> Profile:
     ParameterError
         If the name or a field is unknown, or a value is out of bounds.
     """
+    check_type("profile", profile, (str, Profile), "a name or a Profile")
     if not isinstance(profile, Profile):
         if profile not in PROFILES:
             raise ParameterError(f"profile is {profile!r}; expected one of: {', '.join(PROFILES)}")

@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from ..core.errors import GeometryError, ParameterError
+from ..core.errors import GeometryError, ParameterError, check_type
 from ..core.solid import judge_solid
 
 FloatArray = NDArray[np.float64]
@@ -284,6 +284,7 @@ def make_scene(
     GeometryError
         If a mesh cannot be read, has no faces or is not closed.
     """
+    check_type("target", target, (str, Path, trimesh.Trimesh), "a name, a mesh file or a mesh")
     decor = empty_mesh()
     cables: tuple[FloatArray, ...] = ()
     if isinstance(target, trimesh.Trimesh):

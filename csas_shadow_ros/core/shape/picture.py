@@ -90,12 +90,9 @@ def _draw_plan(axes: Any, result: Result) -> None:
     for one in result.objects:
         dims = one.dimensions
         (cx, cy), (length, width) = dims.position_m, (dims.length_m, dims.width_m)
-        style: dict[str, Any] = {
-            "angle": math.degrees(dims.heading_rad),
-            "rotation_point": "center",
-            "fill": False,
-        }
-        axes.add_patch(Rectangle((cx - length / 2, cy - width / 2), length, width, ec="red", **style))
+        box = Rectangle((cx - length / 2, cy - width / 2), length, width, rotation_point="center")
+        box.set(angle=math.degrees(dims.heading_rad), fill=False, edgecolor="red")
+        axes.add_patch(box)
     axes.set_aspect("equal")
     axes.set_title(title)
     axes.set_xlabel("x, east (m)")
