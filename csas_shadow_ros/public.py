@@ -11,9 +11,9 @@ from typing import Any, Literal, Protocol
 from .bags import Run
 from .core.errors import InputTypeError, ParameterError, check_range, check_type
 from .core.geometry import CoherentImage, Track
-from .core.parameters import MAX_OBJECTS, MOST_OBJECTS, PipelineParameters
+from .core.parameters import MAX_OBJECTS, MOST_OBJECTS, PipelineParameters, StartFrom
 from .core.pipeline import Result
-from .from_bag import StartFrom, reconstruct_run
+from .from_bag import reconstruct_run
 from .parameter_file import pipeline_parameters, read_parameter_file
 from .progress import ProgressOption, progress_bar
 
