@@ -24,7 +24,15 @@ from csas_shadow_ros.core.geometry import (
 from csas_shadow_ros.core.sector import Sector
 from csas_shadow_ros.core.volume import Volume
 
-from .messages import MessageFactory, check_frame, check_type, make_header, stamp_to_ns
+from .messages import (
+    MAX_COORDINATE_M,
+    MessageFactory,
+    check_frame,
+    check_type,
+    make_header,
+    quoted,
+    stamp_to_ns,
+)
 from .topics import (
     CAMERA_INFO,
     CSAS_IMAGE,
@@ -93,7 +101,9 @@ class SectorInfo(GroundInfo):
 def _named(field: str) -> Iterator[None]:
     """Turn core's refusals into ones that name the message's field."""
     try:
-        yield
+        # Huge numbers overflow on the way to being refused: that is no news for a node's standard error.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            yield
     except AdapterError:
         raise
     except CsasError as error:
@@ -120,7 +130,8 @@ def _entries(msg: Any, allowed: tuple[str, ...], where: str) -> FloatArray:
     """Return D after checking distortion_model, length and finiteness."""
     model = msg.distortion_model
     if model not in allowed:
-        raise AdapterError(f"{where}.distortion_model is {model!r}; expected one of: {', '.join(allowed)}")
+        expected = ", ".join(allowed)
+        raise AdapterError(f"{where}.distortion_model is {quoted(model)}; expected one of: {expected}")
     names = D_ENTRIES[model]
     d = np.array(msg.d, dtype=np.float64)
     if d.shape != (len(names),):
@@ -287,6 +298,12 @@ def view_info_from_msg(msg: Any, stream_name: str) -> ViewInfo:
     rows, cols = _size(msg, where)
     with _named(f"{where}.p"):
         camera = ShadowCamera(_projection(msg, where), rows, cols)
+    if np.abs(camera.sonar_m).max() > MAX_COORDINATE_M:
+        sonar = ", ".join(f"{v:.6g}" for v in camera.sonar_m)
+        raise AdapterError(
+            f"{where}.p puts the sonar at [{sonar}] m; expected coordinates of at most"
+            f" {MAX_COORDINATE_M:.6g} m"
+        )
     down = camera.pixel_to_ground[:2, 1]
     along = float(down @ down_range_axis(aspect)) / float(np.hypot(*down))
     if along < math.cos(MAX_ASPECT_MISMATCH_RAD):

@@ -9,7 +9,7 @@ from typing import Any
 from csas_shadow_ros.core.errors import AdapterError
 from csas_shadow_ros.core.shape.result import ViewEvidence
 
-from .messages import MessageFactory
+from .messages import MAX_STAMP_NS, MessageFactory, quoted
 from .statuses import Status, Value, statuses_from_msg, statuses_to_msg
 
 _WHERE = "evidence"
@@ -56,8 +56,8 @@ def evidence_from_msg(msg: Any) -> dict[int, ViewEvidence]:
     _, statuses = statuses_from_msg(msg, _WHERE)
     found = {}
     for name, status in statuses.items():
-        if not (name.isascii() and name.isdecimal()):
-            raise AdapterError(f"{_WHERE} has a status named {name!r}; expected a view's stamp in ns")
+        if not (name.isascii() and name.isdecimal() and len(name) < 20 and int(name) <= MAX_STAMP_NS):
+            raise AdapterError(f"{_WHERE} has a status named {quoted(name)}; expected a view's stamp in ns")
         x, y, z = status.reals("sonar_x_m", "sonar_y_m", "sonar_z_m", finite=True)
         found[int(name)] = ViewEvidence(
             stamp_ns=int(name),

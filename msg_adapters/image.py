@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from csas_shadow_ros.core.errors import AdapterError
 
-from .messages import MessageFactory, check_frame, check_type, make_header
+from .messages import MessageFactory, check_frame, check_type, make_header, quoted
 from .topics import IMAGE, MATTER_ENCODING, VOXEL_ENCODING, ImageStream, stream
 
 MAX_SIDE = 1 << 16
@@ -46,7 +46,7 @@ def _layout(encoding: str, allowed: tuple[str, ...], where: str) -> tuple[str, i
                 return _VOXEL_SCALARS[kind], int(match.group(1)), False
     elif encoding in allowed and encoding in _FIXED:
         return _FIXED[encoding]
-    raise AdapterError(f"{where}.encoding is {encoding!r}; expected one of: {', '.join(allowed)}")
+    raise AdapterError(f"{where}.encoding is {quoted(encoding)}; expected one of: {', '.join(allowed)}")
 
 
 def pixels_from_msg(msg: Any, encodings: tuple[str, ...], where: str = "image") -> NDArray[Any]:
@@ -261,7 +261,7 @@ def quantise(pixels: NDArray[Any], encoding: str, peak: float = 0.0) -> NDArray[
         If the encoding is no complex integer one, or the image is not finite or holds only zeros.
     """
     if encoding not in ("8SC2", "16SC2"):
-        raise AdapterError(f"encoding is {encoding!r}; expected 8SC2 or 16SC2")
+        raise AdapterError(f"encoding is {quoted(encoding)}; expected 8SC2 or 16SC2")
     check_pixels(pixels, stream("image"))
     scale = np.iinfo(_FIXED[encoding][0]).max / max(peak, largest_part(pixels))
     out = np.empty(pixels.shape, np.complex64)
@@ -311,7 +311,8 @@ def check_pixels(pixels: NDArray[Any], kind: ImageStream) -> None:
     elif content == "likelihood":
         _refuse((pixels < 0) | (pixels > 1), pixels, where, "outside [0, 1]", "likelihoods in [0, 1]")
         return
-    if not np.any(pixels, where=finite):
+    # Not the pixels themselves: a signalling NaN warns.
+    if not np.any(pixels != 0, where=finite):
         raise AdapterError(f"{where} holds only zeros; expected an image")
 
 

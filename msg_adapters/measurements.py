@@ -15,7 +15,7 @@ from csas_shadow_ros.core.seabed import SeabedSlope
 from csas_shadow_ros.core.shape.result import QUALITIES, VERDICTS, LeftOut, ObjectResult, Quality, Result
 from csas_shadow_ros.core.volume import Target, VoxelGrid
 
-from .messages import MessageFactory
+from .messages import MessageFactory, quoted
 from .progress import Level
 from .statuses import (
     RUN,
@@ -282,7 +282,7 @@ def _object_values(one: ObjectResult) -> dict[str, Value]:
         if name in d.intervals:
             values[f"{key}.low"], values[f"{key}.high"] = d.intervals[name]
     if unknown := sorted(set(d.intervals) - set(_KEYS)):
-        raise AdapterError(f"there is an interval of {unknown[0]!r}; expected of: {', '.join(_KEYS)}")
+        raise AdapterError(f"there is an interval of {quoted(unknown[0])}; expected of: {', '.join(_KEYS)}")
     values["views"] = int(one.views_used)
     return values | _grid_values(one.grid) | target_values(one.target, _TARGET)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import array
 import importlib
 import math
+import struct
 from functools import lru_cache
 from typing import Any, Protocol
 
@@ -26,6 +27,28 @@ MAX_STAMP_NS = (1 << 31) * NANOSECONDS - 1
 _DEFAULTS: dict[str, dict[str, Any]] = {"geometry_msgs/msg/Quaternion": {"w": 1.0}}
 
 FLOAT_TYPES = ("float", "double", "float32", "float64")
+
+#: No place on Earth has a larger coordinate on any map (m): half of the equator. UTM has up to 10 000 km.
+MAX_COORDINATE_M = 2.004e7
+#: So many characters of a message's value are quoted: an encoding or a frame is shorter, and a line of the
+#: terminal holds it with what was expected.
+MAX_QUOTED = 40
+
+
+def quoted(value: Any) -> str:
+    """Return a value as an error quotes it: a text in quotation marks, cut to about 40 characters.
+
+    Examples
+    --------
+    >>> quoted("map")
+    "'map'"
+    >>> quoted("m" * 1_000_000)
+    "'mmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmm'… (1000000 characters)"
+    """
+    if isinstance(value, str) and len(value) > MAX_QUOTED:
+        return f"{value[:MAX_QUOTED]!r}… ({len(value)} characters)"
+    text = repr(value)
+    return text if len(text) <= 2 * MAX_QUOTED else f"{text[:MAX_QUOTED]}…"
 
 
 class MessageFactory(Protocol):
@@ -138,7 +161,7 @@ class RosbagsMessages:
         known = {name for name, _ in names}
         if unknown := sorted(set(fields) - known):
             raise AdapterError(
-                f"{type_name} has no field {unknown[0]!r}; expected one of: {', '.join(sorted(known))}"
+                f"{type_name} has no field {quoted(unknown[0])}; expected one of: {', '.join(sorted(known))}"
             )
         fields = _DEFAULTS.get(type_name, {}) | fields
         return cls(**{name: fields[name] if name in fields else self._default(kind) for name, kind in names})
@@ -191,13 +214,125 @@ def message_from_cdr(cdr: bytes | memoryview, type_name: str, where: str) -> Any
     AdapterError
         If the bytes are no message of it.
     """
+    if type_name == PackedPath.__msgtype__:
+        return PackedPath(cdr, where)
+    return _decoded(cdr, type_name, where)
+
+
+def _decoded(cdr: bytes | memoryview, type_name: str, where: str) -> Any:
     from rosbags.serde import SerdeError
 
     try:
         # Of bytes rosbags would take a slice, which is a copy of them all.
         return typestore().deserialize_cdr(memoryview(cdr), type_name)
-    except (SerdeError, AssertionError, IndexError, OverflowError, MemoryError) as error:
-        raise AdapterError(f"{where} is no {type_name}: {error or 'too short'}") from error
+    except (SerdeError, AssertionError, IndexError, OverflowError, MemoryError, ValueError) as error:
+        # Also text that is no UTF-8, whose error quotes all of the text.
+        reason = type(error).__name__ if isinstance(error, ValueError) else str(error)[:120] or "too short"
+        raise AdapterError(f"{where} is no {type_name}: {reason}") from error
+
+
+#: A Path of more is refused: 200 Hz, as fast as inertial navigation comes, over 83 minutes. At half of it
+#: all of such a mission in one Path is refused; at double a message of 160 MB is taken.
+MAX_POSES = 1_000_000
+#: What follows a pose's header: position and orientation.
+_POSE_BYTES = 56
+
+
+class PackedPath:
+    """A serialised nav_msgs/Path, read without an object for each pose: 200 000 take seconds otherwise.
+
+    Parameters
+    ----------
+    cdr : bytes-like
+        The message.
+    where : str
+        What it is, for errors.
+
+    Raises
+    ------
+    AdapterError
+        If the bytes are no Path, or it has too many poses.
+    """
+
+    __msgtype__ = "nav_msgs/msg/Path"
+
+    def __init__(self, cdr: bytes | memoryview, where: str) -> None:
+        self._cdr, self._where = memoryview(cdr).cast("B"), where
+        self._message: Any = None
+        #: Stamp (sec, nanosec) and position of each pose, and the frame of all; None if that is not one.
+        self.table: tuple[NDArray[np.int64], NDArray[np.float64], str] | None = None
+        body = self._cdr[4:]
+        if len(body) < 16 or self._cdr[0] != 0 or self._cdr[1] > 1:
+            raise AdapterError(f"{where} is no {self.__msgtype__}: too short, or no plain CDR")
+        order = "<" if self._cdr[1] == 1 else ">"
+        (length,) = struct.unpack_from(f"{order}I", body, 8)
+        at = 12 + length + -length % 4
+        if at + 4 > len(body):
+            raise AdapterError(f"{where} is no {self.__msgtype__}: too short")
+        (self.count,) = struct.unpack_from(f"{order}I", body, at)
+        if self.count > MAX_POSES:
+            raise AdapterError(f"{where} has {self.count} poses; expected at most {MAX_POSES}")
+        if self.count:
+            self.table = self._alike(body, at + 4, order)
+        if self.table is None:
+            self._message = _decoded(cdr, self.__msgtype__, where)
+            self.header = self._message.header
+            return
+        sec, nanosec = struct.unpack_from(f"{order}iI", body, 0)
+        factory = RosbagsMessages()
+        self.header = factory.make(
+            "std_msgs/msg/Header",
+            stamp=factory.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec),
+            frame_id=_text(body[12 : 12 + length], where),
+        )
+
+    def _alike(
+        self, body: memoryview, at: int, order: str
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], str] | None:
+        """Read poses whose frames are all the same, so that they lie evenly; None if they do not."""
+        if at + 12 > len(body):
+            return None
+        (length,) = struct.unpack_from(f"{order}I", body, at + 8)
+        # Doubles begin at multiples of 8, so all poses but the first are aligned alike.
+        size = 12 + length
+        first_end = at + size + -(at + size) % 8 + _POSE_BYTES
+        stride = size + -size % 8 + _POSE_BYTES
+        if not length or first_end + (self.count - 1) * stride != len(body):
+            return None
+        stamps = np.empty((self.count, 2), np.int64)
+        positions = np.empty((self.count, 3))
+        name = bytes(body[at + 12 : at + size])
+        stamps[0] = struct.unpack_from(f"{order}iI", body, at)
+        positions[0] = struct.unpack_from(f"{order}3d", body, first_end - _POSE_BYTES)
+        if self.count > 1:
+            row = np.dtype(
+                {
+                    "names": ["sec", "nanosec", "length", "name", "xyz"],
+                    "formats": [f"{order}i4", f"{order}u4", f"{order}u4", f"({length},)u1", f"(3,){order}f8"],
+                    "offsets": [0, 4, 8, 12, stride - _POSE_BYTES],
+                    "itemsize": stride,
+                }
+            )
+            rows = np.frombuffer(body, row, self.count - 1, first_end)
+            alike = (rows["length"] == length).all() and (rows["name"] == np.frombuffer(name, np.uint8)).all()
+            if not alike:
+                return None
+            stamps[1:, 0], stamps[1:, 1], positions[1:] = rows["sec"], rows["nanosec"], rows["xyz"]
+        return stamps, positions, _text(memoryview(name), self._where)
+
+    @property
+    def poses(self) -> Any:
+        """The poses, one by one."""
+        if self._message is None:
+            self._message = _decoded(self._cdr, self.__msgtype__, self._where)
+        return self._message.poses
+
+
+def _text(raw: memoryview, where: str) -> str:
+    try:
+        return bytes(raw[:-1]).decode()
+    except UnicodeDecodeError:
+        raise AdapterError(f"{where} is no {PackedPath.__msgtype__}: a frame is no UTF-8") from None
 
 
 def type_name_of(msg: Any) -> str:
@@ -247,6 +382,20 @@ def stamp_to_ns(stamp: Any, where: str = "header.stamp") -> int:
     return sec * NANOSECONDS + nanosec
 
 
+def data_stamp_to_ns(stamp: Any, where: str) -> int:
+    """Read the stamp of an image or a sector as nanoseconds.
+
+    Raises
+    ------
+    AdapterError
+        If it is no time, or 0: that is what ROS has where nobody set a stamp, or no clock runs.
+    """
+    found = stamp_to_ns(stamp, where)
+    if not found:
+        raise AdapterError(f"{where} is 0; expected the time when its last data came")
+    return found
+
+
 def stamp_from_ns(factory: MessageFactory, stamp_ns: int) -> Any:
     """Make a ``builtin_interfaces/Time``.
 
@@ -276,7 +425,7 @@ def check_frame(msg: Any, where: str) -> None:
     """
     frame = msg.header.frame_id
     if frame != SCENE_FRAME:
-        raise AdapterError(f"{where}.header.frame_id is {frame!r}; expected {SCENE_FRAME!r}")
+        raise AdapterError(f"{where}.header.frame_id is {quoted(frame)}; expected {SCENE_FRAME!r}")
 
 
 def point(factory: MessageFactory, xyz: Any, type_name: str = "geometry_msgs/msg/Point") -> Any:

@@ -27,7 +27,7 @@ from .camera_info import (
     voxel_info_to_msg,
 )
 from .image import image_from_msg, image_to_msg
-from .messages import MessageFactory, stamp_to_ns
+from .messages import MessageFactory, data_stamp_to_ns, stamp_to_ns
 from .topics import stream
 
 
@@ -40,6 +40,7 @@ def coherent_image_from_msgs(image: Any, info: Any) -> CoherentImage:
         If either message breaks the contract or they do not belong together.
     """
     check_pair(image, info, "image")
+    data_stamp_to_ns(image.header.stamp, "image.header.stamp")
     ground = ground_info_from_msg(info)
     return CoherentImage(image_from_msg(image, "image"), ground.grid, ground.acoustics, ground.stamp_ns)
 
@@ -64,6 +65,7 @@ def sector_from_msgs(image: Any, info: Any) -> Sector:
         If either message breaks the contract or they do not belong together.
     """
     check_pair(image, info, "sector/image")
+    data_stamp_to_ns(image.header.stamp, "sector/image.header.stamp")
     s = sector_info_from_msg(info)
     pixels = image_from_msg(image, "sector")
     return Sector(pixels, s.grid, s.acoustics, s.stamp_ns, s.aspect_rad, s.aperture_rad, s.carrier_rad_m)

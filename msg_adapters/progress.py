@@ -9,7 +9,7 @@ from typing import Any
 
 from csas_shadow_ros.core.errors import AdapterError
 
-from .messages import MessageFactory, check_type, make_header, stamp_to_ns
+from .messages import MessageFactory, check_type, make_header, quoted, stamp_to_ns
 from .topics import DIAGNOSTICS
 
 HEARTBEAT = "heartbeat"
@@ -65,10 +65,10 @@ class ViewProgress:
     def __post_init__(self) -> None:
         if self.outcome not in (INTEGRATED, PUBLISHED, REJECTED):
             expected = f"{INTEGRATED}, {PUBLISHED} or {REJECTED}"
-            raise AdapterError(f"outcome is {self.outcome!r}; expected {expected}")
+            raise AdapterError(f"outcome is {quoted(self.outcome)}; expected {expected}")
         if (self.outcome == REJECTED) != bool(self.reason):
             raise AdapterError(
-                f"reason of a view {self.outcome} is {self.reason!r}; expected one just if rejected"
+                f"reason of a view {self.outcome} is {quoted(self.reason)}; expected one just if rejected"
             )
 
     @classmethod
@@ -108,7 +108,7 @@ class Heartbeat:
 
     def __post_init__(self) -> None:
         if self.role not in ROLES:
-            raise AdapterError(f"role is {self.role!r}; expected one of: {', '.join(ROLES)}")
+            raise AdapterError(f"role is {quoted(self.role)}; expected one of: {', '.join(ROLES)}")
 
 
 def instance_of(graph_id: str, process: str) -> str:
@@ -203,7 +203,7 @@ def progress_from_msg(msg: Any) -> ViewProgress | Heartbeat:
                 counts[key.removeprefix("count.")] = int(value)
             except ValueError:
                 raise AdapterError(
-                    f"{where}.status[0].values: {key} is {value!r}; expected a count"
+                    f"{where}.status[0].values: {quoted(key)} is {quoted(value)}; expected a count"
                 ) from None
         others = {k: v for k, v in values.items() if k != "role" and not k.startswith("count.")}
         return Heartbeat(stamp, status.name, status.hardware_id, values.get("role", ""), counts, others)

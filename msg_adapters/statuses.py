@@ -15,7 +15,7 @@ from csas_shadow_ros.core.errors import AdapterError
 from csas_shadow_ros.core.shape.result import LeftOut
 from csas_shadow_ros.core.volume import Target
 
-from .messages import MessageFactory, check_frame, check_type, make_header, stamp_to_ns
+from .messages import MessageFactory, check_frame, check_type, make_header, quoted, stamp_to_ns
 from .progress import Level
 from .topics import DIAGNOSTICS
 
@@ -69,10 +69,10 @@ class Status:
 
     def refuse(self, key: str, expected: str) -> AdapterError:
         """Return the error that a value is not what it must be."""
-        return AdapterError(f"{self._at(key)} is {self.values[key]!r}; expected {expected}")
+        return AdapterError(f"{self._at(key)} is {quoted(self.values[key])}; expected {expected}")
 
     def _at(self, key: str) -> str:
-        return f"{self.where}, status {self.name!r}: {key}"
+        return f"{self.where}, status {quoted(self.name)}: {key}"
 
     def __contains__(self, key: str) -> bool:
         return key in self.values
@@ -190,7 +190,8 @@ def statuses_from_msg(msg: Any, where: str) -> tuple[int, dict[str, Status]]:
         if code not in Level._value2member_map_:
             raise AdapterError(f"{where}.status[{i}].level is {code}; expected 0 to 3")
         if one.name in found:
-            raise AdapterError(f"{where}.status[{i}].name is {one.name!r} again; expected one status a name")
+            name = quoted(one.name)
+            raise AdapterError(f"{where}.status[{i}].name is {name} again; expected one status a name")
         values = {v.key: v.value for v in one.values}
         found[one.name] = Status(one.name, values, one.message, Level(code), where)
     return stamp_to_ns(msg.header.stamp, f"{where}.header.stamp"), found

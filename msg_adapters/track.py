@@ -11,7 +11,20 @@ from numpy.typing import NDArray
 from csas_shadow_ros.core.errors import AdapterError, CsasError
 from csas_shadow_ros.core.geometry import Track, TrackPiece
 
-from .messages import SCENE_FRAME, MessageFactory, check_frame, check_type, make_header, point, stamp_to_ns
+from .messages import (
+    MAX_COORDINATE_M,
+    MAX_POSES,
+    NANOSECONDS,
+    SCENE_FRAME,
+    MessageFactory,
+    PackedPath,
+    check_frame,
+    check_type,
+    make_header,
+    point,
+    quoted,
+    stamp_to_ns,
+)
 from .topics import PATH
 
 DEFAULT_MAX_GAP_RAD = math.radians(3.0)
@@ -20,6 +33,9 @@ DEFAULT_MAX_GAP_RAD = math.radians(3.0)
 MAX_BAD_POSES = 0.01
 #: So many of them are named one by one.
 MAX_NOTES = 3
+#: A few poses so long before or after all others (ns) were stamped by no clock that ran, or by another one:
+#: a day. A circle takes minutes; at half of it and at double the same poses are found, of 1970 or of 2106.
+MAX_PAUSE_NS = 86_400 * NANOSECONDS
 
 
 def track_to_msg(factory: MessageFactory, track: Track) -> Any:
@@ -75,8 +91,9 @@ def track_piece_from_msg(msg: Any) -> TrackPiece:
     Returns
     -------
     TrackPiece
-        Without the poses that cannot be used (not finite, not above the seabed, over the scene's origin,
-        stamped out of order), if they are at most 1 % of all, or one. Its notes name them.
+        Without the poses that cannot be used (not finite, on no map of the Earth, not above the seabed, over
+        the scene's origin, stamped out of order or more than a day off the others), if they are at most 1 %
+        of all, or one. Its notes name them.
 
     Raises
     ------
@@ -90,7 +107,13 @@ def track_piece_from_msg(msg: Any) -> TrackPiece:
     header_ns = stamp_to_ns(msg.header.stamp, "track.header.stamp")
     bad: dict[int, str] = {}
     for i in np.flatnonzero(~np.isfinite(positions).all(axis=1)).tolist():
-        bad[i] = f"track pose {i} is {positions[i].tolist()}; expected finite metres"
+        bad[i] = f"track pose {i} is {_brief(positions[i])}; expected finite metres"
+    for i in np.flatnonzero((np.abs(positions) > MAX_COORDINATE_M).any(axis=1)).tolist():
+        bad.setdefault(
+            i,
+            f"track pose {i} is at {_brief(positions[i])} m; expected coordinates of at most"
+            f" {MAX_COORDINATE_M:.6g} m",
+        )
     low = np.flatnonzero(positions[:, 2] <= 0.0)
     for i in low.tolist():
         bad.setdefault(
@@ -112,7 +135,11 @@ def track_piece_from_msg(msg: Any) -> TrackPiece:
             last = i
             continue
         bad[i] = f"track stamps are out of order: {bad[i]}"
-    if len(bad) > max(1, int(MAX_BAD_POSES * n)) or len(bad) == n:
+    allowed = max(1, int(MAX_BAD_POSES * n))
+    far = _far_in_time(stamps, [i for i in good if i not in bad])
+    if len(bad) + len(far) <= allowed:
+        bad |= far
+    if len(bad) > allowed or len(bad) == n:
         first = min(bad)
         hint = ""
         if len(low) == n:
@@ -127,19 +154,63 @@ def track_piece_from_msg(msg: Any) -> TrackPiece:
     return TrackPiece(stamps[kept], positions[kept], header_ns, notes)
 
 
+def _brief(xyz: NDArray[np.float64]) -> str:
+    return "[" + ", ".join(f"{v:.6g}" for v in xyz) + "]"
+
+
+def _far_in_time(stamps: NDArray[np.int64], good: list[int]) -> dict[int, str]:
+    """Return, by pose, why those that are more than a day off most of the others cannot be used."""
+    if len(good) < 2:
+        return {}
+    parts = np.split(np.array(good), np.flatnonzero(np.diff(stamps[good]) > MAX_PAUSE_NS) + 1)
+    most = max(parts, key=len)
+    first, last = int(stamps[most[0]]), int(stamps[most[-1]])
+    return {
+        i: f"track pose {i} ({stamps[i]} ns) is more than a day off the others ({first} to {last} ns)"
+        for part in parts
+        if part is not most
+        for i in part.tolist()
+    }
+
+
 def _poses(msg: Any) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     check_type(msg, PATH, "track")
     check_frame(msg, "track")
+    stamps, positions = _packed(msg) if getattr(msg, "table", None) is not None else _one_by_one(msg)
+    if len(stamps) > 1 and not stamps.any():
+        raise AdapterError("track.poses: no pose is stamped (all are 0); expected when the sonar was there")
+    return stamps, positions
+
+
+def _one_by_one(msg: Any) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     n = len(msg.poses)
+    if n > MAX_POSES:
+        raise AdapterError(f"track has {n} poses; expected at most {MAX_POSES}")
     stamps = np.empty(n, np.int64)
     positions = np.empty((n, 3))
     for i, pose in enumerate(msg.poses):
-        frame = pose.header.frame_id
-        if frame not in ("", SCENE_FRAME):
-            raise AdapterError(f"track.poses[{i}].header.frame_id is {frame!r}; expected {SCENE_FRAME!r}")
+        _check_pose_frame(i, pose.header.frame_id)
         stamps[i] = stamp_to_ns(pose.header.stamp, f"track.poses[{i}].header.stamp")
         p = pose.pose.position
         positions[i] = p.x, p.y, p.z
-    if n > 1 and not stamps.any():
-        raise AdapterError("track.poses: no pose is stamped (all are 0); expected when the sonar was there")
     return stamps, positions
+
+
+def _check_pose_frame(i: int, frame: str) -> None:
+    if frame not in ("", SCENE_FRAME):
+        raise AdapterError(f"track.poses[{i}].header.frame_id is {quoted(frame)}; expected {SCENE_FRAME!r}")
+
+
+def _packed(msg: PackedPath) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    assert msg.table is not None
+    times, positions, frame = msg.table
+    _check_pose_frame(0, frame)
+    wrong = (times[:, 0] < 0) | (times[:, 1] >= NANOSECONDS)
+    if wrong.any():
+        i = int(wrong.argmax())
+        sec, nanosec = times[i].tolist()
+        raise AdapterError(
+            f"track.poses[{i}].header.stamp is {sec} s {nanosec} ns; expected sec >= 0 and nanosec in"
+            " [0, 1e9)"
+        )
+    return times[:, 0] * NANOSECONDS + times[:, 1], positions

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from csas_shadow_ros.core.errors import AdapterError
 from csas_shadow_ros.core.volume import VoxelGrid
 
-from .messages import MessageFactory, check_frame, check_type, make_header, stamp_to_ns
+from .messages import MessageFactory, check_frame, check_type, make_header, quoted, stamp_to_ns
 from .topics import POINT_CLOUD
 
 _POINT = np.dtype(
@@ -146,7 +146,7 @@ def voxels_from_msg(msg: Any, where: str = "voxels") -> Voxels:
             )
         found[field.name] = (kind, int(field.offset))
     if missing := [name for name in _ALLOWED if name not in found]:
-        raise AdapterError(f"{where}.fields lacks {missing[0]!r}; expected {', '.join(_ALLOWED)}")
+        raise AdapterError(f"{where}.fields lacks {quoted(missing[0])}; expected {', '.join(_ALLOWED)}")
     row_step = int(msg.row_step)
     if row_step < step * cols:
         raise AdapterError(

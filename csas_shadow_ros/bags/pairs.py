@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from csas_shadow_ros.core.errors import CsasError
-from msg_adapters.messages import stamp_to_ns
+from msg_adapters.messages import quoted, stamp_to_ns
 from msg_adapters.topics import TOPICS, absolute_name, stream
 
 from .bag import BagMessage, BagReader
@@ -71,7 +71,7 @@ def checked_messages(
         return
     expected = TOPICS[relative].type_name
     if info.type_name != expected:
-        report(Problem(info.name, None, None, f"its type is {info.type_name!r}; expected {expected}"))
+        report(Problem(info.name, None, None, f"its type is {quoted(info.type_name)}; expected {expected}"))
         return
     seen: dict[int, bytes | memoryview] = {}
 

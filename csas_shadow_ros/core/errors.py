@@ -35,8 +35,22 @@ class SpectrumSignError(CsasError, ValueError):
     """The image contradicts its stated spectrum sign: its shadows fall towards the sonar."""
 
 
+#: What a message's error may take: a few lines of a terminal. Values that are quoted are cut before.
+_MOST_CHARACTERS = 290
+
+
 class AdapterError(CsasError, ValueError):
-    """A message breaks the contract; the error names the field, the value and what was expected."""
+    """A message breaks the contract; the error names the field, the value and what was expected.
+
+    One line, whatever the message holds: what is longer loses its middle.
+    """
+
+    def __init__(self, text: str) -> None:
+        line = " ".join("".join(c if c.isprintable() else " " for c in text[:10_000]).split())
+        if len(line) > _MOST_CHARACTERS:
+            half = _MOST_CHARACTERS // 2
+            line = f"{line[:half]} … {line[-half + 3 :]}"
+        super().__init__(line)
 
 
 class BagError(CsasError, ValueError):

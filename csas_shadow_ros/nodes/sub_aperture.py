@@ -28,6 +28,7 @@ from msg_adapters import (
     Pairer,
     TargetBox,
     coherent_image_from_msgs,
+    data_stamp_to_ns,
     decision_to_msg,
     message_from_cdr,
     sector_from_msgs,
@@ -191,17 +192,20 @@ class SubApertureNode(CsasNode):
 
     def place_image(self, image: Any, info: Any, since_s: float) -> None:
         """Give an image to the run whose track covers its stamp; one without such a track waits."""
-        stamp = stamp_to_ns(image.header.stamp, "image.header.stamp")
+        stamp = data_stamp_to_ns(image.header.stamp, "image.header.stamp")
         reason, patience_s = self.track.image_hold(stamp)
         if not reason:
             self.take_run_image(self.track.run_of(stamp), stamp, image, info)
         elif time.monotonic() - since_s > patience_s:
             raise ViewError(f"image stamped {stamp} ns: {reason}; it is not used")
         else:
-            self.unplaced = [
-                held for held in self.unplaced if stamp_to_ns(held[1].header.stamp) != stamp
-            ][1 - _MOST_UNPLACED :]
-            self.unplaced.append((since_s, image, info))
+            others = [held for held in self.unplaced if stamp_to_ns(held[1].header.stamp) != stamp]
+            for _, given_up, _ in others[: 1 - _MOST_UNPLACED]:
+                gone = stamp_to_ns(given_up.header.stamp)
+                self.reject(
+                    f"image stamped {gone} ns: {reason}, and {_MOST_UNPLACED} newer ones wait for one"
+                )
+            self.unplaced = [*others[1 - _MOST_UNPLACED :], (since_s, image, info)]
 
     def take_run_image(self, name: int | None, stamp: int, image: Any, info: Any) -> None:
         """Begin a run with its full-circle image."""

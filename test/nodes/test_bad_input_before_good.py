@@ -82,3 +82,17 @@ def test_an_image_that_contradicts_its_own_spectrum_is_refused_and_the_next_one_
     outside.image(simulated.image)
     graph.spin_until(lambda: has_views(node))
     assert not node.error
+
+
+def test_an_image_that_nobody_stamped_is_refused_at_once_and_the_next_one_used(
+    graph: Graph, simulated: SimulatedRun
+) -> None:
+    node = graph.add(SubApertureNode, step_deg=STEP_DEG)
+    outside = Outside(graph)
+    track = simulated.track
+    # In simulated time the track begins at 0, and would cover that stamp.
+    outside.track(Track(track.stamps_ns - track.stamps_ns[0], track.positions_m))
+    outside.image(replace(simulated.image, stamp_ns=0))
+    graph.spin_until(lambda: any("header.stamp is 0; expected" in r for r in node.examples.values()))
+    outside.image(replace(simulated.image, stamp_ns=int(track.stamps_ns[-1] - track.stamps_ns[0])))
+    graph.spin_until(lambda: has_views(node))

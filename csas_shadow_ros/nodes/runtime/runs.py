@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from csas_shadow_ros.core.geometry.runs import TrackBook
-from msg_adapters import track_piece_from_msg
+from msg_adapters import TOPICS, message_from_cdr, track_piece_from_msg
 
 from .. import qos
 
@@ -30,15 +30,15 @@ class RunFollower:
         Called with the run that a Path belongs to, and the names that have changed since.
     """
 
-    def __init__(
-        self, node: CsasNode, on_track: Callable[[int, dict[int, int]], None] | None = None
-    ) -> None:
+    def __init__(self, node: CsasNode, on_track: Callable[[int, dict[int, int]], None] | None = None) -> None:
         self.book = TrackBook()
         self._on_track = on_track
-        node.subscribe_latched("track", self._take, profile=qos.TRACK)
+        # Raw: rclpy makes an object of each pose, which takes seconds where there are 200 000.
+        node.subscribe_latched("track", self._take, profile=qos.TRACK, raw=True)
 
-    def _take(self, msg: Any) -> None:
-        name = self.book.add(track_piece_from_msg(msg))
+    def _take(self, cdr: bytes) -> None:
+        path = message_from_cdr(cdr, TOPICS["track"].type_name, "track")
+        name = self.book.add(track_piece_from_msg(path))
         if self._on_track is not None:
             self._on_track(name, dict(self.book.renamed))
 
