@@ -25,10 +25,11 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSCompatibility, ReliabilityPolicy, qos_check_compatible
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from csas_shadow_ros.core.errors import CsasError, ParameterError
 from csas_shadow_ros.core.geometry import View
@@ -73,6 +74,8 @@ _LONELY_S = 5.0
 _STOP_S = 0.05
 #: How often it is looked who publishes latched topics: sooner than a large image is through.
 _DURABILITY_S, _WHO_S = 0.05, 1.0
+#: How often it is asked anew who publishes a topic, where their number is the same.
+_STRANGERS_S = 5.0
 
 
 def kind_of(reason: str) -> str:
@@ -146,6 +149,8 @@ class CsasNode(LifecycleNode):
         self.sources: list[Source] = []
         self._owned: list[tuple[Callable[[Any], Any], Any]] = []
         self._unlatched: list[Unlatched] = []
+        #: Publishers of our topics of which nothing can be heard.
+        self.strangers = Strangers(self)
         self._logged: dict[str, tuple[float, int]] = {}
         self._rates: dict[str, tuple[int, float]] = {}
         self._beat_lock = threading.Lock()
@@ -215,11 +220,13 @@ class CsasNode(LifecycleNode):
         kind = self.messages.cls(topic_of(topic).type_name)
         made = self.create_subscription(kind, topic, guarded, profile, raw=raw)
         self._owned.append((self.destroy_subscription, made))
+        self.strangers.subscribed(made)
         return made
 
     def unsubscribe(self, subscription: Subscription) -> None:
         """Take a subscription back."""
         self._owned.remove((self.destroy_subscription, subscription))
+        self.strangers.unsubscribed(subscription)
         self.destroy_subscription(subscription)
 
     def subscribe_latched(
@@ -236,7 +243,7 @@ class CsasNode(LifecycleNode):
             # One timer for all topics: a recorder follows dozens.
             self.every(_DURABILITY_S, self._look_for_unlatched)
         self._unlatched.append(
-            Unlatched(self, topic, lambda: self.subscribe(topic, qos.UNLATCHED, callback, raw=raw))
+            Unlatched(self, topic, lambda profile: self.subscribe(topic, profile, callback, raw=raw))
         )
         return made
 
@@ -426,9 +433,12 @@ class CsasNode(LifecycleNode):
         values |= {k: str(v) for k, v in self.state_counts().items()} | self.state_values()
         for source in self.sources:
             values |= {f"{source.stream} {k}": str(v) for k, v in source.counts().items()}
-        waiting = self.waiting()
+        waiting, unheard = self.waiting(), list(self.strangers.unheard.values())
+        values |= {f"not heard {n}": text for n, text in enumerate(unheard, 1)}
         if self.trouble or self.unable:
             level, text = Level.ERROR, self.trouble or self.unable
+        elif unheard:
+            level, text = Level.WARN, "; ".join([unheard[0], *([waiting] if waiting else [])])
         elif waiting:
             level, text = Level.WARN, waiting
         elif self.counts["rejected"]:
@@ -453,6 +463,7 @@ class CsasNode(LifecycleNode):
             self.error = self.unable = ""
             self.setup()
             self.every(1.0, self._publish_diagnostics)
+            self.every(_WHO_S, self.strangers.look)
             self.every(0.2, self._tick)
         except (CsasError, OSError) as error:
             self.error = str(error)
@@ -519,6 +530,7 @@ class CsasNode(LifecycleNode):
         self.inlets.clear()
         self.sources.clear()
         self._unlatched.clear()
+        self.strangers.clear()
         while self._owned:
             destroy, entity = self._owned.pop()
             destroy(entity)
@@ -589,12 +601,22 @@ class Background:
             self._node.guard("work", self._callback)
 
 
+def _latches(publisher: TopicEndpointInfo) -> bool:
+    """Say whether a publisher keeps its messages for us; none does that is best effort."""
+    profile = publisher.qos_profile
+    return bool(
+        profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        and profile.reliability != ReliabilityPolicy.BEST_EFFORT
+    )
+
+
 class Unlatched:
     """A second subscription to a latched topic, for publishers that do not latch it.
 
     Such publishers do not match the first one, and those that latch match both: what they publish would come
     twice, an image of hundreds of megabytes too. It is there as long as nobody publishes, or somebody who
-    does not latch.
+    does not latch. Where one of those is best effort it is so too: each message of these topics is whole by
+    itself, and what is lost on the way leaves what was there before.
 
     Parameters
     ----------
@@ -603,16 +625,17 @@ class Unlatched:
     topic : str
         Name of the topic.
     subscribe : callable
-        Makes the subscription.
+        Makes the subscription, of a quality of service.
     """
 
-    def __init__(self, node: CsasNode, topic: str, subscribe: Callable[[], Subscription]) -> None:
+    def __init__(self, node: CsasNode, topic: str, subscribe: Callable[[Any], Subscription]) -> None:
         self._node = node
         self._topic = topic
         self._subscribe = subscribe
         self._publishers = 0
         self._asked_s = time.monotonic()
-        self.subscription: Subscription | None = subscribe()
+        self._profile = qos.UNLATCHED
+        self.subscription: Subscription | None = subscribe(self._profile)
 
     def look(self) -> None:
         """Subscribe, or take the subscription back, as publishers have come and gone."""
@@ -623,13 +646,98 @@ class Unlatched:
         self._publishers, self._asked_s = count, now
         name = self._node.resolve_topic_name(self._topic)
         publishers = self._node.get_publishers_info_by_topic(name)
-        latching = [p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers]
-        wanted = not all(latching) or not latching
-        if wanted and self.subscription is None:
-            self.subscription = self._subscribe()
-        elif not wanted and self.subscription is not None:
+        plain = [p for p in publishers if not _latches(p)]
+        lossy = [p for p in plain if p.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT]
+        profile = qos.LOSSY if lossy else qos.UNLATCHED
+        wanted = bool(plain) or not publishers
+        if self.subscription is not None and (not wanted or profile is not self._profile):
             self._node.unsubscribe(self.subscription)
             self.subscription = None
+        if wanted and self.subscription is None:
+            self._profile = profile
+            self.subscription = self._subscribe(profile)
+            for p in lossy:
+                who = f"{p.node_namespace.rstrip('/')}/{p.node_name}"
+                self._node.get_logger().warning(
+                    f"{name}: {who} publishes best effort: what is lost on the way is not sent again"
+                )
+
+
+class Strangers:
+    """Publishers of a node's topics of which it hears nothing: their type or their QoS does not match.
+
+    ROS says nothing of the one, and of the other only a line of the middleware's own.
+
+    Parameters
+    ----------
+    node : CsasNode
+        The node.
+    """
+
+    def __init__(self, node: CsasNode) -> None:
+        self._node = node
+        self._subscriptions: list[Subscription] = []
+        #: Number of publishers of each topic, and when it was asked who they are.
+        self._asked: dict[str, tuple[int, float]] = {}
+        #: What is wrong with each, by topic and endpoint.
+        self.unheard: dict[tuple[str, bytes], str] = {}
+
+    def subscribed(self, subscription: Subscription) -> None:
+        """Look after a subscription."""
+        self._subscriptions.append(subscription)
+
+    def unsubscribed(self, subscription: Subscription) -> None:
+        """Look after it no longer."""
+        self._subscriptions.remove(subscription)
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._subscriptions.clear()
+        self._asked.clear()
+        self.unheard.clear()
+
+    def look(self) -> None:
+        """See who publishes, and name in the log, once, whoever cannot be heard."""
+        ours: dict[str, list[Subscription]] = {}
+        for subscription in self._subscriptions:
+            ours.setdefault(subscription.topic_name, []).append(subscription)
+        now = time.monotonic()
+        for topic, subscriptions in ours.items():
+            # Who they are takes longer to ask than how many; one may have taken another's place.
+            count, (before, since_s) = self._node.count_publishers(topic), self._asked.get(topic, (0, now))
+            if count == before and (not count or now - since_s < _STRANGERS_S):
+                continue
+            self._asked[topic] = count, now
+            found = {
+                (topic, bytes(publisher.endpoint_gid)): text
+                for publisher in self._node.get_publishers_info_by_topic(topic)
+                if (text := self._fault(topic, publisher, subscriptions))
+            }
+            for key, text in found.items():
+                if key not in self.unheard:
+                    self._node.get_logger().warning(text)
+            self.unheard = {k: v for k, v in self.unheard.items() if k[0] != topic} | found
+
+    @staticmethod
+    def _fault(topic: str, publisher: TopicEndpointInfo, subscriptions: list[Subscription]) -> str:
+        """Say why a publisher cannot be heard; empty if it can."""
+        who = f"{topic}: {publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
+        expected = _type_name(subscriptions[0].msg_type)
+        if publisher.topic_type != expected:
+            return f"{who} publishes {publisher.topic_type}, which is not taken; expected {expected}"
+        offered = publisher.qos_profile
+        checks = [qos_check_compatible(offered, one.qos_profile) for one in subscriptions]
+        if any(level != QoSCompatibility.ERROR for level, _ in checks):
+            return ""
+        if offered.reliability == ReliabilityPolicy.BEST_EFFORT:
+            return f"{who} publishes {expected} best effort, which is not taken; expected it reliable"
+        if offered.durability == DurabilityPolicy.VOLATILE:
+            return f"{who} publishes {expected} volatile, which is not taken; expected it transient local"
+        return f"{who} publishes {expected} with a QoS that is not taken: {checks[0][1].rstrip('; ')}"
+
+
+def _type_name(kind: Any) -> str:
+    return f"{'/'.join(kind.__module__.split('.')[:2])}/{kind.__name__}"
 
 
 class Inlet:

@@ -8,11 +8,11 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 MAX_WINDOW = 8
 
 
-def _profile(depth: int, *, latched: bool) -> QoSProfile:
+def _profile(depth: int, *, latched: bool, lossy: bool = False) -> QoSProfile:
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
+        reliability=ReliabilityPolicy.BEST_EFFORT if lossy else ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
 
@@ -30,6 +30,9 @@ TRACK = _profile(64, latched=True)
 #: The same topics from an outside publisher that does not latch: subscribed to besides `LATCHED`, since
 #: a transient_local subscription does not match a volatile publisher.
 UNLATCHED = _profile(8, latched=False)
+
+#: The same where that publisher is best effort, as drivers are: a reliable subscription does not match it.
+LOSSY = _profile(8, latched=False, lossy=True)
 
 #: Reports of views: kept for a source that restarts, so that it need not send what is done already. Longer
 #: runs only forget the oldest, which are then sent again and found to be in already.
