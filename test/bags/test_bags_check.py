@@ -11,15 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from csas_shadow_ros.bags import BagWriter, check_bag, write_run
+from csas_shadow_ros.bags import BagWriter, check_bag, read_run, write_run
 from csas_shadow_ros.bags.check import (
     band_energy,
     check_spectrum_sign,
     judge_band,
     judge_energy,
     judge_geometry,
+    judge_stuck,
 )
-from csas_shadow_ros.core.errors import ViewError
+from csas_shadow_ros.core.errors import BagError, ViewError
 from csas_shadow_ros.core.geometry import (
     Acoustics,
     CoherentImage,
@@ -31,6 +32,7 @@ from csas_shadow_ros.core.geometry import (
     view_ground_to_pixel,
 )
 from csas_shadow_ros.core.target import SignEvidence
+from csas_shadow_ros.process import refuse_contradictions
 from msg_adapters import RosbagsMessages, coherent_image_to_msgs, track_to_msg, view_to_msgs
 
 START_NS = 1_700_000_000_000_000_000
@@ -424,3 +426,54 @@ def test_a_second_image_is_a_warning(tmp_path):
     bag = write_run(tmp_path / "run", annulus_image(), circle(), extra=[("image", a), ("camera_info", b)])
     finding = next(f for f in check_bag(bag).findings if f.level == "warning")
     assert "second image" in finding.problem
+
+
+def with_pixels(level_db, *places):
+    """Return a sound image with single pixels of a level over its median."""
+    image = annulus_image()
+    pixels = image.pixels.copy()
+    for place in places:
+        pixels[place] = np.median(np.abs(pixels)) * 10 ** (level_db / 20)
+    return replace(image, pixels=pixels)
+
+
+@pytest.mark.parametrize("place", [(0, 0), (40, 100), (SIDE - 1, SIDE - 1)], ids=str)
+@pytest.mark.parametrize(("level_db", "level"), [(42.0, "warning"), (60.0, "error"), (80.0, "error")])
+def test_a_stuck_pixel_is_named_with_its_level_and_refused_where_it_costs_the_shape(place, level_db, level):
+    ((found, problem, remedy),) = judge_stuck(with_pixels(level_db, place))
+    assert found == level
+    assert f"the pixel in row {place[0]}, column {place[1]} is {level_db:.0f} dB over the median" in problem
+    assert ("it is used as it is" in problem) == (level == "warning")
+    assert "Set it to 0" in remedy
+
+
+def test_several_stuck_pixels_are_counted():
+    ((_, problem, _),) = judge_stuck(with_pixels(70.0, (3, 4), (60, 60), (100, 2)))
+    assert "(and 2 more like it)" in problem
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(20.0, SIDE - 20.0), st.floats(20.0, SIDE - 20.0), st.floats(30.0, 80.0))
+def test_a_bright_point_anywhere_between_the_pixels_is_no_stuck_pixel(row, col, level_db):
+    image = annulus_image()
+    k = 2 * np.pi * np.fft.fftfreq(SIDE)
+    low, _, high = (SPACING_M * edge for edge in ACOUSTICS.ground_band(math.atan2(18, 75)))
+    radius = np.hypot(k[:, None], k[None, :])
+    band = (radius >= low) & (radius <= high)
+    point = np.fft.ifft2(np.where(band, np.exp(-1j * (k[:, None] * row + k[None, :] * col)), 0))
+    point *= np.median(np.abs(image.pixels)) * 10 ** (level_db / 20) / np.abs(point).max()
+    assert levels(judge_stuck(replace(image, pixels=(image.pixels + point).astype(np.complex64)))) == []
+
+
+def test_run_refuses_an_image_with_a_stuck_pixel_and_reports_a_lesser_one(tmp_path):
+    for level_db, refused in ((60.0, True), (42.0, False)):
+        path = write_run(tmp_path / f"{level_db:.0f}", with_pixels(level_db, (40, 100)), circle())
+        found = read_run(path)
+        told: list[str] = []
+        if refused:
+            with pytest.raises(BagError, match=r"pixel in row 40, column 100 is 60 dB over the median"):
+                refuse_contradictions(found.image, found.track, told.append, found)
+            continue
+        refuse_contradictions(found.image, found.track, told.append, found)
+        assert "row 40, column 100 is 42 dB" in told[0]
+        assert "row 40, column 100 is 42 dB" in str(found.problems[0])
