@@ -600,11 +600,12 @@ def judge_stuck(image: CoherentImage) -> Iterator[tuple[str, str, str]]:
     more = f" (and {count - 1} more like it)" if count > 1 else ""
     share = float(own[stuck].sum(dtype=np.float64)) / float(power.sum(dtype=np.float64))
     refused = over > REFUSED_STUCK_DB
+    used = "" if refused else "; it is used as it is"
     yield (
         ERROR if refused else WARNING,
         f"the pixel in row {row[worst]}, column {col[worst]}{more} is {over:.0f} dB over the median, and"
         f" {STUCK_OVER_NEIGHBOURS_DB:.0f} dB or more over all round it, with {100 * share:.0f} % of all"
-        f" energy: it is stuck, and its sidelobes lie over the shadows{'' if refused else '; it is used as it is'}",
+        f" energy: it is stuck, and its sidelobes lie over the shadows{used}",
         "Set it to 0, or to what is round it: one pixel less changes no shadow.",
     )
 

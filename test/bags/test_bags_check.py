@@ -477,3 +477,25 @@ def test_run_refuses_an_image_with_a_stuck_pixel_and_reports_a_lesser_one(tmp_pa
         refuse_contradictions(found.image, found.track, told.append, found)
         assert "row 40, column 100 is 42 dB" in told[0]
         assert "row 40, column 100 is 42 dB" in str(found.problems[0])
+
+
+@pytest.mark.parametrize("count", [1, 7, 8])
+def test_poses_without_a_fix_are_left_out_with_how_many_until_they_are_too_many(tmp_path, count):
+    image, info, path = run_messages(track=circle(720))
+    for one in path.poses[300 : 300 + count]:
+        one.pose.position.x = math.nan
+    bag = write(tmp_path / "bag", ("/csas/image", image), ("/csas/camera_info", info), ("/csas/track", path))
+    report = check_bag(bag)
+    told = [
+        f.problem for f in report.findings if "finite metres" in f.problem or "more track poses" in f.problem
+    ]
+    if count > 7:  # 1 % of 720
+        assert not report.ok
+        assert "(8 of 720 poses cannot be used)" in told[0]
+        return
+    assert report.ok
+    assert report.usable["track"] == 720 - count
+    assert len(told) == min(count, 4)
+    assert [str(p.reason) for p in read_run(bag).problems] == told
+    if count > 3:
+        assert told[-1] == "4 more track poses cannot be used: left out"

@@ -11,7 +11,7 @@ import pytest
 
 from csas_shadow_ros.bags import BagReader, check_bag, read_run, write_run
 from csas_shadow_ros.cli import main
-from csas_shadow_ros.core.geometry import GroundGrid
+from csas_shadow_ros.core.geometry import GroundGrid, Track
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.sector import Sector
 from csas_shadow_ros.nodes.playing import BagViews
@@ -132,6 +132,13 @@ def test_aspects_that_the_track_contradicts_are_told_of(run, sectors, tmp_path) 
         for s, stamp in zip(sectors, stamps, strict=True)
     ]
     assert "another aspect" not in texts(check_bag(written(tmp_path / "turn", run, early)), "warning")
+
+
+def test_a_track_whose_x_and_y_are_swapped_is_told_of_by_what_sectors_say(run, sectors, tmp_path) -> None:
+    # North-east axes with an altitude: a circle round the origin looks the same, but is passed the other way.
+    north_east = Track(run.track.stamps_ns, run.track.positions_m[:, [1, 0, 2]])
+    bag = write_run(tmp_path / "swapped", None, north_east, sectors=sectors)
+    assert "sectors state another aspect than the track has" in texts(check_bag(bag), "warning")
 
 
 def test_what_contradicts_itself_in_all_sectors_is_an_error_as_in_an_image(run, sectors, tmp_path) -> None:
