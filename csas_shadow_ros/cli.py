@@ -494,6 +494,7 @@ def _add_replay(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 def _replay_options(p: argparse.ArgumentParser) -> None:
     p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
+    p.add_argument("--namespace", help="namespace of its topics (found by itself)")
     p.add_argument(
         "--start-from",
         choices=START_FROM,
@@ -532,6 +533,7 @@ def _add_view(add: Callable[..., argparse.ArgumentParser]) -> None:
         _view,
     )
     p.add_argument("path", metavar="DIR|BAG", help="a results folder, or a bag that holds views")
+    p.add_argument("--namespace", help="namespace of the bag's topics (found by itself)")
     p.add_argument("--host", default="127.0.0.1", help="address to listen at (default 127.0.0.1)")
     p.add_argument("--port", type=int, default=0, metavar="N", help="port (default: any that is free)")
     p.add_argument("--token", help="token to ask for (default: none here, a new one on a network)")
@@ -639,7 +641,7 @@ def _view(arguments: argparse.Namespace, console: Console) -> int:
     if arguments.html is not None:
         if not 1 <= arguments.every <= 360:
             raise ParameterError(f"--every is {arguments.every}; expected 1 to 360")
-        size = command.save_html(arguments.path, arguments.html, arguments.every)
+        size = command.save_html(arguments.path, arguments.html, arguments.every, arguments.namespace)
         console.result(f"{arguments.html}: {_size(size)}", {"file": arguments.html, "bytes": size})
         return OK
 
@@ -649,6 +651,7 @@ def _view(arguments: argparse.Namespace, console: Console) -> int:
 
     command.view(
         arguments.path,
+        namespace=arguments.namespace,
         host=arguments.host,
         port=arguments.port,
         token=arguments.token,
@@ -816,7 +819,6 @@ def _replay(arguments: argparse.Namespace, console: Console) -> int:
     from .process import replay_bag
 
     parameters = parameters_of(arguments)
-    arguments.namespace = None
     code = OK
     for number, out in _runs_and_folders(arguments):
         with console.bar("views") as bar:
@@ -827,6 +829,7 @@ def _replay(arguments: argparse.Namespace, console: Console) -> int:
                 start_from=arguments.start_from,
                 rate=arguments.rate,
                 domain_id=arguments.domain_id,
+                namespace=arguments.namespace,
                 run_of_bag=number,
                 max_objects=arguments.max_objects,
                 overwrite=arguments.overwrite,

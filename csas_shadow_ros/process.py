@@ -147,6 +147,7 @@ def replay_bag(
     start_from: str = "auto",
     rate: float = 0.0,
     domain_id: int | None = None,
+    namespace: str | None = None,
     run_of_bag: int | None = None,
     max_objects: int = MAX_OBJECTS,
     overwrite: bool = False,
@@ -161,8 +162,8 @@ def replay_bag(
 
     Parameters
     ----------
-    bag, out, parameters, start_from, run_of_bag, max_objects, overwrite, write_bag, figures, durable
-    command, progress, notice
+    bag, out, parameters, start_from, namespace, run_of_bag, max_objects, overwrite, write_bag, figures
+    durable, command, progress, notice
         See `process_bag`.
     rate : float
         Views: times the recorded speed; 0: as fast as the nodes take them.
@@ -196,7 +197,7 @@ def replay_bag(
         out, overwrite=overwrite, bag=write_bag, figures=figures, durable=durable, notice=notice
     ) as writer:
         began = time.perf_counter()
-        run = read_run(bag, None, run_of_bag)
+        run = read_run(bag, namespace, run_of_bag)
         context = Context(p, command)
         context.read_truth(bag)
         image = None
@@ -214,6 +215,7 @@ def replay_bag(
             scratch,
             p,
             stage=stage,
+            namespace=run.namespace,
             rate=rate,
             domain_id=domain_id,
             record=True,

@@ -371,6 +371,7 @@ def replay(
     parameters: PipelineParameters | None = None,
     *,
     stage: str = "auto",
+    namespace: str | None = None,
     rate: float = 0.0,
     record: str | Path | bool = False,
     composites: bool = True,
@@ -396,6 +397,8 @@ def replay(
         Parameters of all stages, as of the in-process pipeline.
     stage : str
         What to play: see the parameter of `bag_player`.
+    namespace : str, optional
+        Namespace of the bag's topics; found by itself if not given.
     rate : float
         Views: times the recorded speed; 0: as fast as the graph takes them.
     record : path-like or bool
@@ -442,9 +445,10 @@ def replay(
                     f"out_dir is {str(out)!r} ({error.strerror}); expected a folder that can be written to"
                 ) from None
         recording = None if record is False else out / "recording" if record is True else Path(record)
-        chosen, decision = _plan(bag, stage, p)
+        chosen, decision = _plan(bag, stage, p, namespace)
         of_stage = node_parameters(p, None if decision is None else decision.target, max_objects)
         plan = _node_plan(bag, chosen, of_stage, rate, recording, composites, window, overrides or {})
+        plan["bag_player"]["bag_namespace"] = namespace or ""
         check(plan)
         domain = stack.enter_context(DomainReservation(domain_id))
         graph_id = new_graph_id()
@@ -475,19 +479,21 @@ def replay(
     return result
 
 
-def _plan(bag: str | Path, stage: str, p: PipelineParameters) -> tuple[str, Decision | None]:
+def _plan(
+    bag: str | Path, stage: str, p: PipelineParameters, namespace: str | None = None
+) -> tuple[str, Decision | None]:
     """Say what is played, and what is carved if no node can decide it."""
     from .bags import BagReader, read_run
     from .nodes.playing import stage_of_bag
 
-    chosen = stage_of_bag(BagReader(bag), stage)
+    chosen = stage_of_bag(BagReader(bag, namespace), stage)
     if chosen in ("image", "sector"):
         return chosen, None
     from .core.stages import check_method
     from .from_bag import decision_of_views
 
     check_method(chosen, p)
-    decision = decision_of_views(read_run(bag), chosen, p, 1)
+    decision = decision_of_views(read_run(bag, namespace), chosen, p, 1)
     if decision.target is None:
         raise NoTargetError(f"there is no object in the {chosen} views of {bag}")
     return chosen, decision

@@ -26,7 +26,7 @@ class BagPlayerNode(CsasNode):
         """Open the bag; begin to serve what is latched."""
         if not self.parameters.bag:
             raise ParameterError("bag is ''; expected the path of a bag")
-        self.reader = BagReader(self.parameters.bag)
+        self.reader = BagReader(self.parameters.bag, self.parameters.bag_namespace or None)
         self.views: BagViews | None = None
         self._began: tuple[float, float] | None = None
         #: When the next view is to be sent at the chosen rate, on the monotonic clock.

@@ -142,6 +142,7 @@ class BagPlayerNodeParameters(NodeParameters, FlowParameters):
     """Parameters of `bag_player`."""
 
     bag: str = bounded("", "bag to play: a rosbag2 directory, or an .mcap or .db3 file")
+    bag_namespace: str = bounded("", "namespace of the bag's topics; empty: found by itself")
     stage: str = bounded(
         "auto",
         "what to play; auto: the earliest that the bag holds whole",

@@ -17,6 +17,7 @@ from .store import ViewerError, ViewStore
 def view(
     path: str | Path,
     *,
+    namespace: str | None = None,
     host: str = "127.0.0.1",
     port: int = 0,
     token: str | None = None,
@@ -34,7 +35,7 @@ def view(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     store = ViewStore()
-    source = PathSource(store, path)
+    source = PathSource(store, path, namespace)
     server = ViewerServer(store, host, port, token)
     server.start()
     say(server.url)
@@ -45,7 +46,7 @@ def view(
     server.stop()
 
 
-def save_html(path: str | Path, out: str | Path, step: int) -> int:
+def save_html(path: str | Path, out: str | Path, step: int, namespace: str | None = None) -> int:
     """Write the page of a results folder or a bag as one HTML file; return its size in bytes.
 
     Raises
@@ -54,7 +55,7 @@ def save_html(path: str | Path, out: str | Path, step: int) -> int:
         If there is nothing to see, what there is cannot be read, or the file cannot be written.
     """
     store = ViewStore()
-    source = PathSource(store, path)
+    source = PathSource(store, path, namespace)
     file = Path(out)
     new = not file.exists()
     try:

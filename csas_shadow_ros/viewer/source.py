@@ -190,6 +190,8 @@ class PathSource:
         The store.
     path : path-like
         A results folder (with its ``result.mcap`` for the views), or a bag.
+    namespace : str, optional
+        Namespace of a bag's topics; found by itself if not given.
 
     Raises
     ------
@@ -197,7 +199,7 @@ class PathSource:
         If there is nothing to see.
     """
 
-    def __init__(self, store: ViewStore, path: str | Path) -> None:
+    def __init__(self, store: ViewStore, path: str | Path, namespace: str | None = None) -> None:
         from ..results.folder import is_results_folder, read_report
 
         self.store = store
@@ -215,7 +217,7 @@ class PathSource:
                 )
             self._use_report()
         self._bag = path
-        self._reader = BagReader(path)
+        self._reader = BagReader(path, namespace if self._folder is None else None)
         self._spool = Spool()
         self._thread: threading.Thread | None = None
         self.done = threading.Event()
@@ -298,7 +300,7 @@ class PathSource:
         store.make_reduced = self._make_reduced
 
     def _make_reduced(self) -> None:
-        run = read_run(self._bag)
+        run = read_run(self._bag, self._reader.namespace)
         Reduced(run.coherent_image(), run.require_track(), self._parameters.sub_aperture).fill(self.store)
 
     def _rest(self, index: BagIndex | None, first: list[str]) -> None:

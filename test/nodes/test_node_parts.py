@@ -7,7 +7,7 @@ import json
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ pytest.importorskip("rclpy")
 
 from graph_of_nodes import Graph
 
-from csas_shadow_ros.bags import BagReader
+from csas_shadow_ros.bags import BagReader, write_run
 from csas_shadow_ros.core.errors import BagError, ParameterError
 from csas_shadow_ros.core.pipeline import ProcessedView, Result
 from csas_shadow_ros.nodes import params, qos
@@ -30,7 +30,8 @@ from csas_shadow_ros.nodes.playing import BagViews, header_stamp, schedule, stag
 from csas_shadow_ros.nodes.shadow_likelihood import ShadowLikelihoodNode
 from csas_shadow_ros.nodes.sub_aperture import SubApertureNode
 from csas_shadow_ros.nodes.voxel_carver import VoxelCarverNode
-from msg_adapters import RclpyMessages
+from csas_shadow_ros.simulation import SimulatedRun
+from msg_adapters import RclpyMessages, RosbagsMessages, coherent_image_to_msgs, stamp_to_ns, track_to_msg
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = {
@@ -441,3 +442,30 @@ def test_a_clock_that_was_set_or_a_pause_of_hours_holds_up_no_playing_and_is_tol
         assert list(seconds) == list(times)
         assert list(seconds.values()) == expected
         assert len(notes) == told
+
+
+def test_a_player_plays_the_run_of_the_namespace_that_it_is_told(
+    graph: Graph, simulated: SimulatedRun, tmp_path: Path
+) -> None:
+    factory = RosbagsMessages()
+    image, info = coherent_image_to_msgs(factory, simulated.image)
+    late = replace(simulated.image, stamp_ns=int(simulated.track.stamps_ns[-2]))
+    other, other_info = coherent_image_to_msgs(factory, late)
+    path = track_to_msg(factory, simulated.track)
+    two = [("/port/image", image), ("/port/camera_info", info), ("/port/track", path)]
+    two += [("/starboard/image", other), ("/starboard/camera_info", other_info), ("/starboard/track", path)]
+    bag = write_run(tmp_path / "two", None, None, extra=two)
+    node = BagPlayerNode(context=graph.context, overrides={"bag": str(bag)})
+    assert not node.start()
+    assert "holds topics of /port and of /starboard" in node.error
+    node.destroy_node()
+    taken: list[int] = []
+    graph.plain_node("listener").create_subscription(
+        RclpyMessages().cls("sensor_msgs/msg/CameraInfo"),
+        "camera_info",
+        lambda msg: taken.append(stamp_to_ns(msg.header.stamp)),
+        qos.LATCHED,
+    )
+    graph.add(BagPlayerNode, bag=str(bag), bag_namespace="starboard")
+    graph.spin_until(lambda: bool(taken))
+    assert taken == [late.stamp_ns]

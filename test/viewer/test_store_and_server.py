@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from synthetic import entry
 
-from csas_shadow_ros.bags import read_run
+from csas_shadow_ros.bags import BagReader, BagWriter, read_run
 from csas_shadow_ros.cli import main
 from csas_shadow_ros.core.mesh import mesh_from_grid
 from csas_shadow_ros.core.parameters import SubApertureParameters
@@ -63,6 +63,19 @@ def test_a_grid_that_is_none_is_named_and_no_page_is_saved_without_it(results, t
     assert main(["view", str(folder), "--html", str(page)]) == 1
     assert "grid.npz cannot be read" in capsys.readouterr().err
     assert not page.exists()
+
+
+def test_views_of_two_namespaces_need_a_name(results, tmp_path, capsys) -> None:
+    two = tmp_path / "two"
+    with BagReader(results / "result.mcap") as reader, BagWriter(two) as writer:
+        for message in reader.messages(["shadow/image", "shadow/camera_info"]):
+            for name in ("port", "starboard"):
+                topic = message.topic.replace("/csas/", f"/{name}/")
+                writer.write(topic, message.cdr, message.log_time_ns, type_name=message.type_name)
+    page = tmp_path / "page.html"
+    assert main(["view", str(two), "--html", str(page), "--every", "36"]) == 1
+    assert "/port and of /starboard" in capsys.readouterr().err
+    assert main(["view", str(two), "--namespace", "port", "--html", str(page), "--every", "36", "-q"]) == 0
 
 
 @pytest.mark.parametrize("where", ["nowhere/page.html", "."])
