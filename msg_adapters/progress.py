@@ -9,7 +9,7 @@ from typing import Any
 
 from csas_shadow_ros.core.errors import AdapterError
 
-from .messages import MessageFactory, check_type, make_header, quoted, stamp_to_ns
+from .messages import MAX_QUOTED, MessageFactory, check_type, make_header, quoted, stamp_to_ns
 from .topics import DIAGNOSTICS
 
 HEARTBEAT = "heartbeat"
@@ -203,7 +203,7 @@ def progress_from_msg(msg: Any) -> ViewProgress | Heartbeat:
                 counts[key.removeprefix("count.")] = int(value)
             except ValueError:
                 raise AdapterError(
-                    f"{where}.status[0].values: {quoted(key)} is {quoted(value)}; expected a count"
+                    f"{where}.status[0].values: {key[:MAX_QUOTED]} is {quoted(value)}; expected a count"
                 ) from None
         others = {k: v for k, v in values.items() if k != "role" and not k.startswith("count.")}
         return Heartbeat(stamp, status.name, status.hardware_id, values.get("role", ""), counts, others)

@@ -451,6 +451,7 @@ class SubApertureNode(CsasNode):
         for level, problem, remedy in found:
             if level == ERROR:
                 raise ViewError(f"{problem}. {remedy}")
+            self.log_throttled(problem, f"{problem}. {remedy}", "warn")
         # Its spectrum is all that the views are made of: the pixels need not stay in memory.
         run.image = None
         return True

@@ -96,3 +96,20 @@ def test_an_image_that_nobody_stamped_is_refused_at_once_and_the_next_one_used(
     graph.spin_until(lambda: any("header.stamp is 0; expected" in r for r in node.examples.values()))
     outside.image(replace(simulated.image, stamp_ns=int(track.stamps_ns[-1] - track.stamps_ns[0])))
     graph.spin_until(lambda: has_views(node))
+
+
+def test_an_image_with_a_stuck_pixel_is_refused_and_one_with_a_lesser_told_of(
+    graph: Graph, simulated: SimulatedRun
+) -> None:
+    node = graph.add(SubApertureNode, step_deg=STEP_DEG)
+    outside = Outside(graph)
+    outside.track(simulated.track)
+    for level_db, back in ((60.0, 5), (42.0, 1)):
+        pixels = simulated.image.pixels.copy()
+        pixels[100, 120] = np.median(np.abs(pixels)) * 10 ** (level_db / 20)
+        outside.image(replace(simulated.image, pixels=pixels, stamp_ns=int(simulated.track.stamps_ns[-back])))
+        if level_db == 60.0:
+            graph.spin_until(lambda: "row 100, column 120 is 60 dB" in node.error)
+    graph.spin_until(lambda: has_views(node))
+    assert not node.error
+    assert any("row 100, column 120 is 42 dB" in kind for kind in node._logged)
