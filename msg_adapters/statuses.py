@@ -273,12 +273,13 @@ def sign_of(status: Status) -> SignEvidence | None:
 
 def left_out_statuses(left_out: Iterable[LeftOut]) -> list[Status]:
     """Return a status for each body that is left out: where it is, and why as its message."""
-    return [
-        Status.of(
-            f"{LEFT_OUT} {number}", {"x_m": one.position_m[0], "y_m": one.position_m[1]}, message=one.reason
-        )
-        for number, one in enumerate(left_out, start=1)
-    ]
+    found = []
+    for number, one in enumerate(left_out, start=1):
+        values: dict[str, Value] = {"x_m": one.position_m[0], "y_m": one.position_m[1]}
+        if one.strong:
+            values["strong"] = True
+        found.append(Status.of(f"{LEFT_OUT} {number}", values, message=one.reason))
+    return found
 
 
 def left_out_of(statuses: Mapping[str, Status]) -> tuple[LeftOut, ...]:
@@ -292,5 +293,6 @@ def left_out_of(statuses: Mapping[str, Status]) -> tuple[LeftOut, ...]:
     found = []
     for status in numbered(statuses, LEFT_OUT).values():
         x, y = status.reals("x_m", "y_m")
-        found.append(LeftOut((x, y), status.message))
+        strong = "strong" in status and status.truth("strong")
+        found.append(LeftOut((x, y), status.message, strong))
     return tuple(found)

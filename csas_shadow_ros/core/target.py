@@ -1,8 +1,11 @@
 """Where is the target, how large a volume must be carved, and does the spectrum's sign fit it?
 
 All three are asked of the shadows: a coarse soft carving of the whole scene with narrow sub-apertures,
-which need no focus. Whatever casts a shadow of its own from all sides stands out as a body; a patch
-of seabed, however bright or dark, does not. "No object" is a valid answer.
+which need no focus. Whatever casts a shadow of its own from all sides stands out as a body. What is then
+asked of each is whether the seabed that only its height can darken, off its own plan and on another side
+from each aspect, is dark: of a patch of dark sediment it is not. Where nothing is evident, a second look
+goes by the mean power alone, relative to its own spread over the scene: thin and faint bodies are too little
+for a likelihood that takes every view by itself. "No object" is a valid answer.
 """
 
 from __future__ import annotations
@@ -10,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.ndimage
@@ -19,7 +22,7 @@ from numpy.typing import NDArray
 from .carving import Carver
 from .errors import NoTargetError, SpectrumSignError, ViewError
 from .geometry import TWO_PI, CoherentImage, ShadowCamera, Track, View
-from .likelihood import outside_likelihood
+from .likelihood import Levels, box_mean, outside_likelihood, view_levels
 from .parameters import (
     CarvingParameters,
     LikelihoodParameters,
@@ -27,6 +30,7 @@ from .parameters import (
     SubApertureParameters,
 )
 from .shadow import enhance
+from .shape.result import LeftOut
 from .subaperture import Spectrum, SubApertures
 from .volume import MARGIN_SHARE, Target, Volume
 
@@ -43,8 +47,39 @@ _MIN_VOXELS = 12
 _CORE = 0.28
 #: The margin is at least this many search voxels.
 _MARGIN_VOXELS = 5
+#: Powers of the search are kept as whole numbers: so many are the seabed's mean, and one says "not known".
+_MEAN, _UNKNOWN = 120, 255
+#: A second-look voxel is dark where its mean power lies so many of its layer's spreads under its layer's
+#: median. Chance alone reaches 5 in the 10^6 voxels of a scene. At 2.5 texture begins bodies, which the thrown
+#: shadow has to refuse; at 10 poles of three cells, whose shadows' far ends are blurred, are not seen.
+_FAINT_SPREADS = 5.0
+#: Search voxels that begin a faint body, and how many of these are looked at, the darkest first: 20 ms each.
+_SEED_VOXELS = 4
+_MOST_SEEDS = 32
+#: A body reaches as far as this from its core's power to the seabed's (share): the edge of a shadow lies
+#: halfway, and a voxel a little outside of it is lit from one side of the circle only. At 0.2 a dome over
+#: dark sediment stays inside the patch, whose rim then seems to be its shadow; at 0.8 speckle is body.
+_REACH = 0.41
+#: The thrown shadow's power, from the core's (0) to the seabed's (1): under the first a body casts it, over
+#: the second none does. Bodies of the development half have 0.1 to 0.35, sediment 0.5 to 0.85. Halved, thin
+#: bodies are doubted; doubled, patches are carved.
+_CAST, _NOT_CAST = 0.4, 0.5
+#: A body throws its shadow at least so many resolution cells off its own plan: less than one is the blur
+#: of its edge. At half, soft edges of sediment seem thrown; at double, bodies of two cells of shadow are
+#: candidates only.
+_THROWN_CELLS = 1.0
+#: Bodies that contradict the stated sign throw their shadow as many times farther than half the width of
+#: their plan. A hollow's shadow ends inside of the hollow: seen the other way round it is a low mound, of 0.7 to 1.
+#: At half of it hollows are wrong signs again; at double a low box does not tell a wrong sign.
+_PROUD = 1.2
 #: The other sign must explain this many times more body than the stated one to be called the right one.
 _SIGN_RATIO = 4.0
+
+#: Why a low body that is consistent only with the other sign is none, and no evidence for that sign either.
+HOLLOW = (
+    "its shadow falls towards the sonar: a hollow in the seabed, or a low body and the wrong spectrum_sign;"
+    " a body that stands out farther was needed to tell"
+)
 
 
 def stands_on_seabed(bottom_m: float, top_m: float) -> bool:
@@ -57,13 +92,43 @@ def stands_on_seabed(bottom_m: float, top_m: float) -> bool:
     return bottom_m <= top_m - bottom_m
 
 
+@dataclass(frozen=True)
+class Thrown:
+    """The shadow that a body's height throws on the seabed off its own plan, on another side in each view.
+
+    Parameters
+    ----------
+    length_m : float
+        How far it reaches over the plan's edge: its area by the plan's width, median of the views.
+    power : float
+        Mean power there, from that of the body's core (0) to that of the seabed (1); NaN where no view knows.
+    core : float
+        Mean power of the body's darkest voxels, over the seabed's.
+    proud : float
+        Its length over half the width of the plan.
+    """
+
+    length_m: float
+    power: float
+    core: float
+    proud: float
+
+    @property
+    def contrast_db(self) -> float:
+        """How far the core lies under the seabed."""
+        return -10.0 * math.log10(max(self.core, 1e-3))
+
+
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What the search found, and the coarse grid that it looked at."""
+    """What the search found and what it left out, and the coarse grid that it looked at."""
 
     targets: tuple[Target, ...]
     volume: Volume
     likelihood: NDArray[np.float32]
+    left_out: tuple[LeftOut, ...] = ()
+    #: The thrown shadow of each target, in the same order.
+    thrown: tuple[Thrown, ...] = ()
 
     @property
     def best(self) -> Target | None:
@@ -92,37 +157,79 @@ def search_views(views: Sequence[View]) -> Search:
     if not views:
         raise NoTargetError("there is no view to find a target in; expected views from several aspects")
     extent = _known_extent(views)
-    return _search(_search_likelihoods(list(views), extent), views[0].info.camera, extent)
+    return _search(_search_looks(list(views), extent), views[0].info.camera, extent)
 
 
-def _search_likelihoods(views: list[View], extent_m: float, workers: int = 2) -> list[View]:
-    """Turn amplitude views into smoothed likelihoods; empties the list, as both would be much memory."""
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What the search keeps of a view: l_out, and the mean power in whole numbers, both smoothed."""
+
+    likelihood: View
+    power: View
+
+    def power_image(self) -> View:
+        """Return the power as soft carving takes it: 0 to 1, of which the seabed's mean is `_MEAN` / 254."""
+        pixels = self.power.pixels.astype(np.float32) / np.float32(_UNKNOWN - 1)
+        pixels[self.power.pixels == _UNKNOWN] = np.nan
+        return replace(self.power, pixels=pixels)
+
+
+def _search_looks(views: list[View], extent_m: float, workers: int = 2) -> list[_Look]:
+    """Turn amplitude views into smoothed looks; empties the list, as both would be much memory."""
     smoothing_m = max(extent_m / _SEARCH_VOXELS, 3.0 * max(views[0].info.camera.spacing_m))
     parameters = LikelihoodParameters(smoothing_m=smoothing_m)
 
-    def likelihood(_: int) -> View | None:
+    def look(_: int) -> _Look | None:
         view = views.pop()
         try:
-            return outside_likelihood(view, parameters)
+            levels = view_levels(view, parameters)
+            return _Look(outside_likelihood(view, parameters, levels), _power(view, levels, parameters))
         except ViewError:
             return None  # a view without levels has nothing to say here; it is reported where it counts
 
     with ThreadPoolExecutor(workers) as pool:
-        return [view for view in pool.map(likelihood, range(len(views))) if view is not None]
+        return [found for found in pool.map(look, range(len(views))) if found is not None]
 
 
-def _search(likelihoods: Iterable[View], camera: ShadowCamera, extent_m: float) -> Search:
-    """Carve the whole scene coarsely and list its bodies; `camera` is any of the views'."""
+def _power(view: View, levels: Levels, parameters: LikelihoodParameters) -> View:
+    rows_m, cols_m = view.info.camera.spacing_m
+    half = parameters.smoothing_m / 2.0
+    mean = box_mean(levels.power, levels.known, (max(1, round(half / rows_m)), max(1, round(half / cols_m))))
+    pixels = np.minimum(mean * np.float32(_MEAN) + np.float32(0.5), _UNKNOWN - 1).astype(np.uint8)
+    pixels[~levels.known | levels.unknown_echoes(parameters)] = _UNKNOWN
+    return replace(view, pixels=pixels)
+
+
+def _search(looks: Sequence[_Look], camera: ShadowCamera, extent_m: float, *, twice: bool = True) -> Search:
+    """Carve the whole scene coarsely and list its bodies; `camera` is any of the views'.
+
+    `twice`: look again for the faint where nothing is evident.
+    """
     middle = camera.pixel_to_ground[:2] @ np.array([(camera.cols - 1) / 2.0, (camera.rows - 1) / 2.0, 1.0])
     voxel = extent_m / _SEARCH_VOXELS
     # Higher bodies throw their shadows off the image, whose voxels stay unknown then.
     height = min(0.75 * extent_m * math.tan(camera.grazing_rad), 0.5 * float(camera.sonar_m[2]))
     volume = Volume.around((float(middle[0]), float(middle[1])), (extent_m, extent_m, height), voxel)
+    mean = _carved(volume, (look.likelihood for look in looks))
+    with np.errstate(invalid="ignore"):
+        bodies = _bodies(mean < _DARK, mean, volume)
+    judged = _Judged()
+    for body in bodies:
+        if body.core <= _CORE:
+            judged.add(body, looks)
+    if twice and not any(target.stands for target, _ in judged.found):
+        _look_again(judged, looks, volume)
+    # Sorting is stable: what is as evident stays in the order of its place.
+    found = sorted(judged.found, key=lambda one: -one[0].evidence)
+    targets, thrown = (tuple(one[n] for one in found) for n in (0, 1))
+    return Search(targets, volume, mean, tuple(judged.left_out), thrown)  # type: ignore[arg-type]
+
+
+def _carved(volume: Volume, images: Iterable[View]) -> NDArray[np.float32]:
     carver = Carver(volume, CarvingParameters(method="soft", min_views_fraction=0.3))
-    for likelihood in likelihoods:
-        carver.integrate(likelihood)
-    mean = carver.likelihood()
-    return Search(tuple(_bodies(mean, volume)), volume, mean)
+    for image in images:
+        carver.integrate(image)
+    return carver.likelihood()
 
 
 def _known_extent(views: Sequence[View]) -> float:
@@ -134,37 +241,177 @@ def _known_extent(views: Sequence[View]) -> float:
     return math.sqrt(float(np.median(areas)))
 
 
-def _bodies(likelihood: NDArray[np.float32], volume: Volume) -> list[Target]:
-    with np.errstate(invalid="ignore"):
-        dark = likelihood < _DARK
-    labels, count = scipy.ndimage.label(dark, np.ones((3, 3, 3), bool))
-    d = volume.voxel_size_m
-    found = []
-    for label, box in enumerate(scipy.ndimage.find_objects(labels, count), start=1):
-        body = labels[box] == label
-        layers = np.flatnonzero(body.any(axis=(1, 2)))
-        if int(body.sum()) < _MIN_VOXELS or len(layers) < 2:
-            continue
-        if np.sort(likelihood[box][body])[:_MIN_VOXELS].mean() > _CORE:
-            continue
-        z = volume.z_m[box[0]]
-        evidence = float((body.sum(axis=(1, 2)) * z).sum()) * d**3
-        low = np.array([volume.x_m[box[2].start], volume.y_m[box[1].start]]) - d / 2
-        high = np.array([volume.x_m[box[2].stop - 1], volume.y_m[box[1].stop - 1]]) + d / 2
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """A piece of dark voxels: their (z, y, x) numbers in a volume, and the mean of the darkest."""
+
+    volume: Volume
+    voxels: tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]
+    core: float
+
+    def target(self) -> Target:
+        """Return what is to be carved of it."""
+        volume, (k, j, i) = self.volume, self.voxels
+        d = volume.voxel_size_m
+        # Layer by layer, so that the sum is the same in whatever order the voxels were found.
+        layers = np.bincount(k - k.min())
+        z = volume.z_m[k.min() : k.max() + 1]
+        evidence = float((layers * z).sum()) * d**3
+        low = np.array([volume.x_m[i.min()], volume.y_m[j.min()]]) - d / 2
+        high = np.array([volume.x_m[i.max()], volume.y_m[j.max()]]) + d / 2
         size = high - low
         margin = np.maximum(MARGIN_SHARE * size, _MARGIN_VOXELS * d)
         top = float(z[-1]) + d / 2
         full = size + 2 * margin
         middle = (low + high) / 2
-        found.append(
-            Target(
-                (float(middle[0]), float(middle[1])),
-                (float(full[0]), float(full[1]), float(top + max(MARGIN_SHARE * top, 2 * d))),
-                evidence,
-                stands_on_seabed(float(z[0]) - d / 2, top),
-            )
+        return Target(
+            (float(middle[0]), float(middle[1])),
+            (float(full[0]), float(full[1]), float(top + max(MARGIN_SHARE * top, 2 * d))),
+            evidence,
+            stands_on_seabed(float(z[0]) - d / 2, top),
         )
-    return sorted(found, key=lambda target: -target.evidence)
+
+    def thrown(self, looks: Sequence[_Look]) -> Thrown:
+        """Look where its height alone can darken the seabed."""
+        volume, (k, j, i) = self.volume, self.voxels
+        d = volume.voxel_size_m
+        x, y, z = volume.x_m[i], volume.y_m[j], volume.z_m[k]
+        plan = np.zeros(volume.shape[1:], np.bool_)
+        plan[j, i] = True
+        area = float(np.count_nonzero(plan))
+        width_m = math.sqrt(area) * d
+        lengths, sums, counts = [], [], []
+        darkest = np.zeros(len(k), np.float64)
+        seen = np.zeros(len(k), np.int64)
+        for look in looks:
+            camera = look.power.info.camera
+            sonar_x, sonar_y, sonar_z = map(float, camera.sonar_m)
+            # Where the ray over a voxel meets the seabed.
+            beyond = z / (sonar_z - z)
+            at_x, at_y = x + (x - sonar_x) * beyond, y + (y - sonar_y) * beyond
+            own, known = _powers_at(look.power, at_x, at_y)
+            darkest += np.where(known, own, 0.0)
+            seen += known
+            i_at = np.rint((at_x - volume.x_m[0]) / d).astype(np.intp)
+            j_at = np.rint((at_y - volume.y_m[0]) / d).astype(np.intp)
+            inside = (i_at >= 0) & (j_at >= 0) & (i_at < plan.shape[1]) & (j_at < plan.shape[0])
+            shadow = np.zeros_like(plan)
+            shadow[j_at[inside], i_at[inside]] = True
+            j_off, i_off = np.nonzero(shadow & ~plan)
+            lengths.append(len(j_off) * d * d / width_m)
+            powers, known = _powers_at(look.power, volume.x_m[i_off], volume.y_m[j_off])
+            sums.append(float(powers[known].sum()))
+            counts.append(int(known.sum()))
+        means = np.sort(darkest[seen > 0] / seen[seen > 0])[:_MIN_VOXELS]
+        core = float(means.mean()) if means.size else 1.0
+        off = sum(sums) / sum(counts) if sum(counts) else math.nan
+        length = float(np.median(lengths))
+        share = (off - core) / max(1.0 - core, 1e-3)
+        return Thrown(length, share, core, 2.0 * length / width_m)
+
+
+def _powers_at(
+    power: View, x_m: NDArray[np.float64], y_m: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return a view's powers at ground positions, the seabed's mean 1, and which of them are known."""
+    camera, pixels = power.info.camera, power.pixels
+    u, v, _ = camera.ground_to_pixel @ np.stack([x_m, y_m, np.ones_like(x_m)])
+    iu, iv = np.rint(u).astype(np.intp), np.rint(v).astype(np.intp)
+    inside = (iu >= 0) & (iv >= 0) & (iu < camera.cols) & (iv < camera.rows)
+    values = np.full(len(x_m), _UNKNOWN, np.uint8)
+    values[inside] = pixels[iv[inside], iu[inside]]
+    return values / float(_MEAN), values != _UNKNOWN
+
+
+def _bodies(
+    dark: NDArray[np.bool_], values: NDArray[np.float32], volume: Volume, least: int = _MIN_VOXELS
+) -> list[_Body]:
+    """Part dark voxels into bodies of at least so many voxels, in two layers."""
+    labels, count = scipy.ndimage.label(dark, np.ones((3, 3, 3), bool))
+    found = []
+    for label, box in enumerate(scipy.ndimage.find_objects(labels, count), start=1):
+        body = labels[box] == label
+        k, j, i = (index + part.start for index, part in zip(np.nonzero(body), box, strict=True))
+        if len(k) < least or k.min() == k.max():
+            continue
+        core = float(np.sort(values[box][body])[:_MIN_VOXELS].mean())
+        found.append(_Body(volume, (k, j, i), core))
+    return found
+
+
+@dataclass
+class _Judged:
+    """Bodies that were found, and those that were not believed."""
+
+    found: list[tuple[Target, Thrown]] = field(default_factory=list)
+    left_out: list[LeftOut] = field(default_factory=list)
+    #: Where the bodies are, on the seabed: (y, x) numbers in the search's volume.
+    plans: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = field(default_factory=list)
+
+    def add(self, body: _Body, looks: Sequence[_Look], *, faint: bool = False) -> None:
+        """Take a body in by the shadow that it throws."""
+        target, thrown = body.target(), body.thrown(looks)
+        self.plans.append(body.voxels[1:])
+        x, y = target.position_m
+        cell = max(looks[0].power.info.resolution_m)
+        if not target.stands:
+            if not faint:
+                self.found.append((target, thrown))
+        elif faint and (thrown.length_m < _THROWN_CELLS * cell or not thrown.power < _NOT_CAST):
+            return  # texture of the seabed, which every scene has
+        elif thrown.length_m < _THROWN_CELLS * cell:
+            self.left_out.append(
+                LeftOut(
+                    (x, y),
+                    f"dark by {thrown.contrast_db:.0f} dB, but throws its shadow only {thrown.length_m:.2f} m:"
+                    f" sediment, or too low to tell; a shadow of {_THROWN_CELLS * cell:.2f} m was needed",
+                    strong=True,
+                )
+            )
+        elif thrown.power <= _CAST:
+            self.found.append((target, thrown))
+        elif not thrown.power < _NOT_CAST:
+            self.left_out.append(
+                LeftOut((x, y), "dark sediment: the same seabed is dark from all sides, no shadow moves")
+            )
+        else:
+            self.left_out.append(
+                LeftOut(
+                    (x, y),
+                    f"dark by {thrown.contrast_db:.0f} dB, but {100 * thrown.power:.0f} % lit where its shadow"
+                    f" must fall: sediment, or a body; at most {100 * _CAST:.0f} % was needed",
+                    strong=True,
+                )
+            )
+
+
+def _look_again(judged: _Judged, looks: Sequence[_Look], volume: Volume) -> None:
+    """Look for the thin and the faint, whose power is low in the mean of all views."""
+    power = _carved(volume, (look.power_image() for look in looks)) * np.float32((_UNKNOWN - 1) / _MEAN)
+    seeds = np.zeros(power.shape, np.bool_)
+    for layer, out in zip(power, seeds, strict=True):
+        known = layer[np.isfinite(layer)]
+        if not known.size:
+            continue
+        median = float(np.median(known))
+        spread = 1.4826 * float(np.median(np.abs(known - median)))
+        with np.errstate(invalid="ignore"):
+            out[:] = layer < median - _FAINT_SPREADS * spread
+    taken = np.zeros(power.shape, np.bool_)
+    for j, i in judged.plans:
+        taken[:, j, i] = True  # it was judged at the first look
+    found = sorted(_bodies(seeds, power, volume, _SEED_VOXELS), key=lambda body: body.core)
+    for seed in found[:_MOST_SEEDS]:
+        k, j, i = seed.voxels
+        if taken[k, j, i].any():
+            continue
+        with np.errstate(invalid="ignore"):
+            labels, _ = scipy.ndimage.label(power < seed.core + _REACH * (1.0 - seed.core), np.ones((3, 3, 3)))
+        darkest = np.argmin(power[k, j, i])
+        whole = np.nonzero(labels == labels[k[darkest], j[darkest], i[darkest]])
+        taken[whole] = True
+        if len(whole[0]) >= _MIN_VOXELS:
+            judged.add(_Body(volume, whole, seed.core), looks, faint=True)
 
 
 def _searching(image: CoherentImage, track: Track, spectrum: Spectrum) -> SubApertures:
@@ -259,19 +506,23 @@ def spectrum_sign_evidence(
     if not views:
         return SignEvidence(sign, 0.0, 0.0), None
     camera, extent = views[0].info.camera, _known_extent(views)
-    likelihoods = _search_likelihoods(views, extent)
+    looks = _search_looks(views, extent)
     other_image = replace(image, acoustics=replace(image.acoustics, spectrum_sign=-sign))
-    turned = _under_other_sign(likelihoods, _searching(other_image, track, spectrum))
-    stated, other = _search(likelihoods, camera, extent), _search(turned, camera, extent)
-    scores = [s.best.evidence if s.best is not None else 0.0 for s in (stated, other)]
-    return SignEvidence(sign, scores[0], scores[1]), stated
+    turned = list(_under_other_sign(looks, _searching(other_image, track, spectrum)))
+    stated, other = _search(looks, camera, extent), _search(turned, camera, extent, twice=False)
+    best = stated.best.evidence if stated.best is not None else 0.0
+    proud = [t.evidence for t, thrown in zip(other.targets, other.thrown, strict=True) if thrown.proud >= _PROUD]
+    evidence = SignEvidence(sign, best, max(proud, default=0.0))
+    if stated.best is None and not proud and other.best is not None:
+        stated = replace(stated, left_out=(*stated.left_out, LeftOut(other.best.position_m, HOLLOW, strong=True)))
+    return evidence, stated
 
 
-def _under_other_sign(views: Sequence[View], other: SubApertures) -> Iterator[View]:
+def _under_other_sign(looks: Sequence[_Look], other: SubApertures) -> Iterator[_Look]:
     """Give the views of the other spectrum sign: that of aspect θ is that of θ + π, turned by 180°."""
-    for view in views:
+    for look in looks:
         try:
-            info = other.info(float((view.info.aspect_rad + math.pi) % TWO_PI))
+            info = other.info(float((look.power.info.aspect_rad + math.pi) % TWO_PI))
         except ViewError:
             continue
-        yield View(info, view.pixels[::-1, ::-1])
+        yield _Look(*(View(info, view.pixels[::-1, ::-1]) for view in (look.likelihood, look.power)))

@@ -91,10 +91,11 @@ def decide(
     p, found = parameters, search.targets if search is not None else ()
     if p.target == "given":
         return Decision(_given(found, p), sign=sign)
+    doubted = search.left_out if search is not None else ()
     if not found:
-        return Decision(None, sign=sign)
+        return Decision(None, left_out=doubted, sign=sign)
     others: list[Target] = []
-    left_out = []
+    left_out = list(doubted)
     for body in found[1:]:
         if not body.stands:
             left_out.append(LeftOut(body.position_m, PHANTOM))

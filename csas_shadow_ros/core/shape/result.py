@@ -79,10 +79,21 @@ class ViewEvidence:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A body that is no object, or was not looked at: where it is (x, y) and why."""
+    """A body that is no object, or was not looked at: where it is (x, y) and why.
+
+    Parameters
+    ----------
+    position_m : (float, float)
+        Where it is.
+    reason : str
+        Why it is none.
+    strong : bool
+        Whether it may well be an object: where it is, "no object" cannot be said.
+    """
 
     position_m: tuple[float, float]
     reason: str
+    strong: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,6 +42,9 @@ def judge(result: Result) -> None:
         worst = 2
     else:
         result.verdict = "no object"
+        reasons += _candidates(result)
+        if reasons:
+            result.verdict, worst = "undecided", 2
     if result.mesh is not None and result.grid is not None:
         for side in cut_sides(result.grid):
             reasons.append(f"the carved volume cuts the object at its {side}")
@@ -58,6 +61,25 @@ def judge(result: Result) -> None:
             reasons.append("too few sides of shadows were seen for intervals")
             worst = max(worst, 1)
     result.quality = Quality(("good", "limited", "not trustworthy")[worst], tuple(reasons))
+
+
+def _candidates(result: Result) -> list[str]:
+    """Name what may be an object and could not be carved."""
+    found = [
+        f"a candidate at ({left.position_m[0] + 0.0:.2f}, {left.position_m[1] + 0.0:.2f}) m: {left.reason}"
+        for left in result.left_out
+        if left.strong
+    ]
+    target = result.target
+    # A volume that was given tells nothing of a shadow in it; one that the search found does.
+    if target is not None and result.final and not math.isnan(target.evidence):
+        x, y = target.position_m
+        found.insert(
+            0,
+            f"a candidate at ({x + 0.0:.2f}, {y + 0.0:.2f}) m: it throws a shadow, but too thin or too faint a one"
+            " to carve with single views; finer resolution or more contrast was needed",
+        )
+    return found
 
 
 def cut_sides(grid: VoxelGrid) -> list[str]:
