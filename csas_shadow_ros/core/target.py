@@ -53,6 +53,12 @@ _MEAN, _UNKNOWN = 120, 255
 #: median. Chance alone reaches 5 in the 10^6 voxels of a scene. At 2.5 texture begins bodies, which the thrown
 #: shadow has to refuse; at 10 poles of three cells, whose shadows' far ends are blurred, are not seen.
 _FAINT_SPREADS = 5.0
+#: Or it is dark where it has less than this of the median: a body and its shadows that fill much of the scene
+#: are most of its spread. 3 dB are the least contrast of the population; at a quarter boxes of 5 dB are lost.
+_FAINT_POWER = 0.5
+#: No voxel of a faint body is less than so many spreads under the median: at half it runs out over the seabed,
+#: at double poles are cut to pieces.
+_LEAST_SPREADS = 2.5
 #: Search voxels that begin a faint body, and how many of these are looked at, the darkest first: 20 ms each.
 _SEED_VOXELS = 4
 _MOST_SEEDS = 32
@@ -60,6 +66,8 @@ _MOST_SEEDS = 32
 #: halfway, and a voxel a little outside of it is lit from one side of the circle only. At 0.2 a dome over
 #: dark sediment stays inside the patch, whose rim then seems to be its shadow; at 0.8 speckle is body.
 _REACH = 0.41
+#: The darkest part of a body reaches as far as this (share, likewise): dark from all sides.
+_STRICT = 0.2
 #: The thrown shadow's power, from the core's (0) to the seabed's (1): under the first a body casts it, over
 #: the second none does. Bodies of the development half have 0.1 to 0.35, sediment 0.5 to 0.85. Halved, thin
 #: bodies are doubted; doubled, patches are carved.
@@ -68,17 +76,18 @@ _CAST, _NOT_CAST = 0.4, 0.5
 #: of its edge. At half, soft edges of sediment seem thrown; at double, bodies of two cells of shadow are
 #: candidates only.
 _THROWN_CELLS = 1.0
-#: Bodies that contradict the stated sign throw their shadow as many times farther than half the width of
-#: their plan. A hollow's shadow ends inside of the hollow: seen the other way round it is a low mound, of 0.7 to 1.
-#: At half of it hollows are wrong signs again; at double a low box does not tell a wrong sign.
-_PROUD = 1.2
+#: Bodies that contradict the stated sign have less than this (power over the seabed's) before them. The other
+#: way round a hollow looks like a body: its far wall, lit, lies before its shadow and is as long. Hollows of
+#: 8 to 30 cm have 1.65 to 1.8 there, bodies 1.0 to 1.6, of which bright flanks seen steeply are the most. At
+#: half no body tells a wrong sign; at double hollows do.
+_PLAIN = 1.5
 #: The other sign must explain this many times more body than the stated one to be called the right one.
 _SIGN_RATIO = 4.0
 
-#: Why a low body that is consistent only with the other sign is none, and no evidence for that sign either.
+#: Why a body that is consistent only with the other sign is none, and no evidence for that sign either.
 HOLLOW = (
-    "its shadow falls towards the sonar: a hollow in the seabed, or a low body and the wrong spectrum_sign;"
-    " a body that stands out farther was needed to tell"
+    "its shadow falls towards the sonar: a hollow in the seabed, or a bright body and the wrong spectrum_sign;"
+    " a body without bright seabed before it was needed to tell"
 )
 
 
@@ -104,14 +113,15 @@ class Thrown:
         Mean power there, from that of the body's core (0) to that of the seabed (1); NaN where no view knows.
     core : float
         Mean power of the body's darkest voxels, over the seabed's.
-    proud : float
-        Its length over half the width of the plan.
+    front : float
+        Mean power as far before the body as its shadow reaches behind it, over the seabed's, echoes as 2.1;
+        median of the views, NaN where that is off the scene.
     """
 
     length_m: float
     power: float
     core: float
-    proud: float
+    front: float
 
     @property
     def contrast_db(self) -> float:
@@ -272,42 +282,86 @@ class _Body:
         )
 
     def thrown(self, looks: Sequence[_Look]) -> Thrown:
-        """Look where its height alone can darken the seabed."""
-        volume, (k, j, i) = self.volume, self.voxels
+        """Look where its height alone can darken the seabed.
+
+        Where the whole body's shadow is not dark, that of its darkest part is looked at, off the whole plan:
+        a body with gaps is surrounded by voxels that are lit from several sides. Over dark sediment nothing
+        is left then, as the part lies inside of the patch with its shadow.
+        """
+        powers = self._powers(looks)
+        known = np.sort(powers[np.isfinite(powers)])[:_MIN_VOXELS]
+        core = float(known.mean()) if known.size else 1.0
+        whole = self._thrown(looks, core, np.ones(len(powers), np.bool_))
+        if whole.power <= _CAST:
+            return whole
+        part = self._thrown(looks, core, powers < core + _STRICT * (1.0 - core))
+        return part if part.power <= _CAST and part.length_m >= _THROWN_CELLS * _cell_m(looks) else whole
+
+    def _powers(self, looks: Sequence[_Look]) -> NDArray[np.float64]:
+        """Mean power of each voxel's shadow, the seabed's 1; NaN where no view knows it."""
+        x, y, z = self._places()
+        total, seen = np.zeros(len(x)), np.zeros(len(x), np.int64)
+        for look in looks:
+            powers, known = _powers_at(look.power, *_cast(look, x, y, z))
+            total += np.where(known, powers, 0.0)
+            seen += known
+        return np.where(seen > 0, total / np.maximum(seen, 1), np.nan)
+
+    def _places(self) -> tuple[NDArray[np.float64], ...]:
+        k, j, i = self.voxels
+        return self.volume.x_m[i], self.volume.y_m[j], self.volume.z_m[k]
+
+    def _thrown(self, looks: Sequence[_Look], core: float, casters: NDArray[np.bool_]) -> Thrown:
+        """Look at what some of its voxels throw off the plan of all."""
+        volume, (_, j, i) = self.volume, self.voxels
         d = volume.voxel_size_m
-        x, y, z = volume.x_m[i], volume.y_m[j], volume.z_m[k]
+        x, y, z = (values[casters] for values in self._places())
         plan = np.zeros(volume.shape[1:], np.bool_)
         plan[j, i] = True
-        area = float(np.count_nonzero(plan))
-        width_m = math.sqrt(area) * d
-        lengths, sums, counts = [], [], []
-        darkest = np.zeros(len(k), np.float64)
-        seen = np.zeros(len(k), np.int64)
+        width_m = math.sqrt(float(np.count_nonzero(plan))) * d
+        lengths, sums, counts, fronts = [], [], [], []
         for look in looks:
-            camera = look.power.info.camera
-            sonar_x, sonar_y, sonar_z = map(float, camera.sonar_m)
-            # Where the ray over a voxel meets the seabed.
-            beyond = z / (sonar_z - z)
-            at_x, at_y = x + (x - sonar_x) * beyond, y + (y - sonar_y) * beyond
-            own, known = _powers_at(look.power, at_x, at_y)
-            darkest += np.where(known, own, 0.0)
-            seen += known
-            i_at = np.rint((at_x - volume.x_m[0]) / d).astype(np.intp)
-            j_at = np.rint((at_y - volume.y_m[0]) / d).astype(np.intp)
-            inside = (i_at >= 0) & (j_at >= 0) & (i_at < plan.shape[1]) & (j_at < plan.shape[0])
-            shadow = np.zeros_like(plan)
-            shadow[j_at[inside], i_at[inside]] = True
-            j_off, i_off = np.nonzero(shadow & ~plan)
-            lengths.append(len(j_off) * d * d / width_m)
-            powers, known = _powers_at(look.power, volume.x_m[i_off], volume.y_m[j_off])
+            at_x, at_y = _cast(look, x, y, z)
+            off_x, off_y = _cells_off(plan, volume, at_x, at_y)
+            lengths.append(len(off_x) * d * d / width_m)
+            powers, known = _powers_at(look.power, off_x, off_y)
             sums.append(float(powers[known].sum()))
             counts.append(int(known.sum()))
-        means = np.sort(darkest[seen > 0] / seen[seen > 0])[:_MIN_VOXELS]
-        core = float(means.mean()) if means.size else 1.0
+            powers, _ = _powers_at(look.power, *_cells_off(plan, volume, 2.0 * x - at_x, 2.0 * y - at_y))
+            fronts.append(float(powers.mean()) if powers.size else math.nan)
         off = sum(sums) / sum(counts) if sum(counts) else math.nan
         length = float(np.median(lengths))
         share = (off - core) / max(1.0 - core, 1e-3)
-        return Thrown(length, share, core, 2.0 * length / width_m)
+        front = float(np.median(fronts))
+        return Thrown(length, share, core, front)
+
+
+def _cell_m(looks: Sequence[_Look]) -> float:
+    """Return the larger side of a resolution cell."""
+    return max(looks[0].power.info.resolution_m)
+
+
+def _cast(
+    look: _Look, x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where the rays over points meet the seabed."""
+    sonar_x, sonar_y, sonar_z = map(float, look.power.info.camera.sonar_m)
+    beyond = z / (sonar_z - z)
+    return x + (x - sonar_x) * beyond, y + (y - sonar_y) * beyond
+
+
+def _cells_off(
+    plan: NDArray[np.bool_], volume: Volume, x_m: NDArray[np.float64], y_m: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the middles of a volume's columns that hold one of the points and are not in a plan."""
+    d = volume.voxel_size_m
+    i = np.rint((x_m - volume.x_m[0]) / d).astype(np.intp)
+    j = np.rint((y_m - volume.y_m[0]) / d).astype(np.intp)
+    inside = (i >= 0) & (j >= 0) & (i < plan.shape[1]) & (j < plan.shape[0])
+    taken = np.zeros_like(plan)
+    taken[j[inside], i[inside]] = True
+    j, i = np.nonzero(taken & ~plan)
+    return volume.x_m[i], volume.y_m[j]
 
 
 def _powers_at(
@@ -353,7 +407,7 @@ class _Judged:
         target, thrown = body.target(), body.thrown(looks)
         self.plans.append(body.voxels[1:])
         x, y = target.position_m
-        cell = max(looks[0].power.info.resolution_m)
+        cell = _cell_m(looks)
         if not target.stands:
             if not faint:
                 self.found.append((target, thrown))
@@ -389,14 +443,16 @@ def _look_again(judged: _Judged, looks: Sequence[_Look], volume: Volume) -> None
     """Look for the thin and the faint, whose power is low in the mean of all views."""
     power = _carved(volume, (look.power_image() for look in looks)) * np.float32((_UNKNOWN - 1) / _MEAN)
     seeds = np.zeros(power.shape, np.bool_)
-    for layer, out in zip(power, seeds, strict=True):
+    limits = np.zeros((len(power), 1, 1), np.float32)
+    for layer, out, limit in zip(power, seeds, limits, strict=True):
         known = layer[np.isfinite(layer)]
         if not known.size:
             continue
         median = float(np.median(known))
         spread = 1.4826 * float(np.median(np.abs(known - median)))
         with np.errstate(invalid="ignore"):
-            out[:] = layer < median - _FAINT_SPREADS * spread
+            out[:] = layer < max(median - _FAINT_SPREADS * spread, _FAINT_POWER * median)
+        limit[:] = median - _LEAST_SPREADS * spread
     taken = np.zeros(power.shape, np.bool_)
     for j, i in judged.plans:
         taken[:, j, i] = True  # it was judged at the first look
@@ -406,11 +462,14 @@ def _look_again(judged: _Judged, looks: Sequence[_Look], volume: Volume) -> None
         if taken[k, j, i].any():
             continue
         with np.errstate(invalid="ignore"):
-            labels, _ = scipy.ndimage.label(power < seed.core + _REACH * (1.0 - seed.core), np.ones((3, 3, 3)))
+            dark = power < np.minimum(limits, seed.core + _REACH * (1.0 - seed.core))
+        labels, _ = scipy.ndimage.label(dark, np.ones((3, 3, 3)))
         darkest = np.argmin(power[k, j, i])
         whole = np.nonzero(labels == labels[k[darkest], j[darkest], i[darkest]])
         taken[whole] = True
-        if len(whole[0]) >= _MIN_VOXELS:
+        (first_j, last_j), (first_i, last_i) = ((n.min(), n.max()) for n in whole[1:])
+        inside = first_j > 0 and first_i > 0 and last_j < power.shape[1] - 1 and last_i < power.shape[2] - 1
+        if len(whole[0]) >= _MIN_VOXELS and inside:  # what leads out of the scene is its level, no body
             judged.add(_Body(volume, whole, seed.core), looks, faint=True)
 
 
@@ -491,7 +550,7 @@ def spectrum_sign_evidence(
     """Compare the bodies found under the stated spectrum sign with those under the other.
 
     A wrong sign turns every view by 180°: what the views then show falls towards the sonar, and no
-    body is consistent with it.
+    body is consistent with it. So does the shadow in a hollow, whose lit far wall tells it from a body.
 
     Returns
     -------
@@ -511,10 +570,15 @@ def spectrum_sign_evidence(
     turned = list(_under_other_sign(looks, _searching(other_image, track, spectrum)))
     stated, other = _search(looks, camera, extent), _search(turned, camera, extent, twice=False)
     best = stated.best.evidence if stated.best is not None else 0.0
-    proud = [t.evidence for t, thrown in zip(other.targets, other.thrown, strict=True) if thrown.proud >= _PROUD]
-    evidence = SignEvidence(sign, best, max(proud, default=0.0))
-    if stated.best is None and not proud and other.best is not None:
-        stated = replace(stated, left_out=(*stated.left_out, LeftOut(other.best.position_m, HOLLOW, strong=True)))
+    contrary = [
+        target.evidence
+        for target, thrown in zip(other.targets, other.thrown, strict=True)
+        if not thrown.front >= _PLAIN
+    ]
+    evidence = SignEvidence(sign, best, max(contrary, default=0.0))
+    if not contrary and other.best is not None and other.best.evidence > _SIGN_RATIO * best:
+        hollow = LeftOut(other.best.position_m, HOLLOW, strong=True)
+        stated = replace(stated, left_out=(*stated.left_out, hollow))
     return evidence, stated
 
 

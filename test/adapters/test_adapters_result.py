@@ -126,7 +126,7 @@ def whole_result():
         further=[an_object(2), an_object(3)],
         left_out=[
             LeftOut((THIRD, -4.0), "it hangs over the seabed; no shadow reaches it"),
-            LeftOut((1.0, 2.0), "x"),
+            LeftOut((1.0, 2.0), "x", strong=True),
         ],
     )
 
