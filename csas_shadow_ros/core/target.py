@@ -50,14 +50,14 @@ _MARGIN_VOXELS = 5
 #: Powers of the search are kept as whole numbers: so many are the seabed's mean, and one says "not known".
 _MEAN, _UNKNOWN = 120, 255
 #: A second-look voxel is dark where its mean power lies so many of its layer's spreads under its layer's
-#: median. Chance alone reaches 5 in the 10^6 voxels of a scene. At 2.5 texture begins bodies, which the thrown
-#: shadow has to refuse; at 10 poles of three cells, whose shadows' far ends are blurred, are not seen.
+#: median. Chance alone reaches 5 in the 10^6 voxels of a scene. At 2.5 texture begins bodies, which the
+#: thrown shadow has to refuse; at 10 poles of three cells, whose shadows' far ends are blurred, are not seen.
 _FAINT_SPREADS = 5.0
 #: Or it is dark where it has less than this of the median: a body and its shadows that fill much of the scene
 #: are most of its spread. 3 dB are the least contrast of the population; at a quarter boxes of 5 dB are lost.
 _FAINT_POWER = 0.5
-#: No voxel of a faint body is less than so many spreads under the median: at half it runs out over the seabed,
-#: at double poles are cut to pieces.
+#: No voxel of a faint body is less than so many spreads under the median: at half it runs out over the
+#: seabed, at double poles are cut to pieces.
 _LEAST_SPREADS = 2.5
 #: Search voxels that begin a faint body, and how many of these are looked at, the darkest first: 20 ms each.
 _SEED_VOXELS = 4
@@ -86,8 +86,8 @@ _SIGN_RATIO = 4.0
 
 #: Why a body that is consistent only with the other sign is none, and no evidence for that sign either.
 HOLLOW = (
-    "its shadow falls towards the sonar: a hollow in the seabed, or a bright body and the wrong spectrum_sign;"
-    " a body without bright seabed before it was needed to tell"
+    "its shadow falls towards the sonar: a hollow in the seabed, or a bright body and the wrong"
+    " spectrum_sign; a body without bright seabed before it was needed to tell"
 )
 
 
@@ -231,8 +231,8 @@ def _search(looks: Sequence[_Look], camera: ShadowCamera, extent_m: float, *, tw
         _look_again(judged, looks, volume)
     # Sorting is stable: what is as evident stays in the order of its place.
     found = sorted(judged.found, key=lambda one: -one[0].evidence)
-    targets, thrown = (tuple(one[n] for one in found) for n in (0, 1))
-    return Search(targets, volume, mean, tuple(judged.left_out), thrown)  # type: ignore[arg-type]
+    targets, thrown = tuple(target for target, _ in found), tuple(thrown for _, thrown in found)
+    return Search(targets, volume, mean, tuple(judged.left_out), thrown)
 
 
 def _carved(volume: Volume, images: Iterable[View]) -> NDArray[np.float32]:
@@ -417,7 +417,7 @@ class _Judged:
             self.left_out.append(
                 LeftOut(
                     (x, y),
-                    f"dark by {thrown.contrast_db:.0f} dB, but throws its shadow only {thrown.length_m:.2f} m:"
+                    f"dark by {thrown.contrast_db:.0f} dB, but throws its shadow {thrown.length_m:.2f} m far:"
                     f" sediment, or too low to tell; a shadow of {_THROWN_CELLS * cell:.2f} m was needed",
                     strong=True,
                 )
@@ -432,8 +432,8 @@ class _Judged:
             self.left_out.append(
                 LeftOut(
                     (x, y),
-                    f"dark by {thrown.contrast_db:.0f} dB, but {100 * thrown.power:.0f} % lit where its shadow"
-                    f" must fall: sediment, or a body; at most {100 * _CAST:.0f} % was needed",
+                    f"dark by {thrown.contrast_db:.0f} dB, but {100 * thrown.power:.0f} % lit where its"
+                    f" shadow must fall: sediment, or a body; at most {100 * _CAST:.0f} % was needed",
                     strong=True,
                 )
             )
@@ -465,7 +465,8 @@ def _look_again(judged: _Judged, looks: Sequence[_Look], volume: Volume) -> None
             dark = power < np.minimum(limits, seed.core + _REACH * (1.0 - seed.core))
         labels, _ = scipy.ndimage.label(dark, np.ones((3, 3, 3)))
         darkest = np.argmin(power[k, j, i])
-        whole = np.nonzero(labels == labels[k[darkest], j[darkest], i[darkest]])
+        z_at, y_at, x_at = np.nonzero(labels == labels[k[darkest], j[darkest], i[darkest]])
+        whole = z_at, y_at, x_at
         taken[whole] = True
         (first_j, last_j), (first_i, last_i) = ((n.min(), n.max()) for n in whole[1:])
         inside = first_j > 0 and first_i > 0 and last_j < power.shape[1] - 1 and last_i < power.shape[2] - 1

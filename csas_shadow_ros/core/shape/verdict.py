@@ -76,8 +76,8 @@ def _candidates(result: Result) -> list[str]:
         x, y = target.position_m
         found.insert(
             0,
-            f"a candidate at ({x + 0.0:.2f}, {y + 0.0:.2f}) m: it throws a shadow, but too thin or too faint a one"
-            " to carve with single views; finer resolution or more contrast was needed",
+            f"a candidate at ({x + 0.0:.2f}, {y + 0.0:.2f}) m: it throws a shadow, but too thin or too faint"
+            " a one to carve with single views; finer resolution or more contrast was needed",
         )
     return found
 
