@@ -1,0 +1,108 @@
+"""The search: faint and thin bodies, dark sediment, hollows, and the sign of the spectrum."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import trimesh
+
+from csas_shadow_ros.core.errors import SpectrumSignError
+from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters, TargetParameters
+from csas_shadow_ros.core.pipeline import run
+from csas_shadow_ros.core.search.decision import decide
+from csas_shadow_ros.core.shape.result import LeftOut, Result
+from csas_shadow_ros.core.shape.verdict import judge
+from csas_shadow_ros.core.subaperture import Spectrum
+from csas_shadow_ros.core.target import search_image, spectrum_sign_evidence
+from csas_shadow_ros.core.volume import Target
+from csas_shadow_ros.simulation import simulate
+from csas_shadow_ros.simulation.profiles import Faults
+from csas_shadow_ros.simulation.seabed import Bump, Patch, Seabed
+
+COARSE = PipelineParameters(sub_aperture=SubApertureParameters(step_deg=6.0))
+PLACE = (0.1, -0.1)
+
+
+def seabed_alone(bed):
+    return simulate("tiny", "empty", seed=2, bed=bed)
+
+
+@pytest.mark.parametrize(("radius_m", "depth_m"), [(0.3, 0.08), (0.6, 0.2), (0.5, 0.3)])
+def test_a_hollow_is_no_wrong_sign_but_a_doubt(radius_m, depth_m):
+    hollow = seabed_alone(Seabed(bumps=(Bump(PLACE, radius_m, -depth_m),)))
+    result = run(hollow.image, hollow.track, COARSE)
+    assert result.verdict == "undecided"
+    assert result.quality.verdict == "not trustworthy"
+    assert any("a hollow in the seabed" in reason for reason in result.quality.reasons)
+
+
+@pytest.mark.parametrize("target", ["box", "cone", "l_shape"])
+def test_bodies_still_tell_a_wrong_sign(target):
+    right = simulate("tiny", target, seed=3, position_m=PLACE)
+    image = replace(right.image, acoustics=replace(right.image.acoustics, spectrum_sign=-1))
+    evidence, _ = spectrum_sign_evidence(image, right.track)
+    assert evidence.verdict == "wrong"
+    with pytest.raises(SpectrumSignError, match=r"expected \+1"):
+        run(image, right.track, COARSE)
+
+
+@pytest.mark.parametrize(("radius_m", "edge"), [(0.3, 0.05), (0.5, 0.2)])
+def test_a_dark_disc_of_sediment_is_no_object(radius_m, edge):
+    disc = seabed_alone(Seabed(patches=(Patch(PLACE, (radius_m, radius_m), 0.0, -12.0, edge),)))
+    result = run(disc.image, disc.track, COARSE)
+    assert result.objects == []
+    assert any("sediment" in left.reason for left in result.left_out)
+
+
+def test_a_faint_box_is_found_or_named_and_its_seabed_alone_is_not():
+    faint = Faults(contrast_db=4.0)
+    with_box = simulate("tiny", "box", seed=3, faults=faint)
+    search = search_image(with_box.image, with_box.track, Spectrum.of_image(with_box.image))
+    assert search.best.stands
+    assert max(map(abs, search.best.position_m)) < 0.1
+    result = run(with_box.image, with_box.track, COARSE)
+    assert result.verdict == "undecided"
+    assert "a candidate at" in result.quality.reasons[0]
+    alone = simulate("tiny", "empty", seed=3, faults=faint)
+    result = run(alone.image, alone.track, COARSE)
+    assert (result.verdict, result.quality.verdict, result.left_out) == ("no object", "good", [])
+
+
+def test_a_pole_thinner_than_a_cell_is_found_or_named():
+    pole = trimesh.creation.cylinder(0.05, 0.35, sections=24)
+    pole.apply_translation((0.0, 0.0, 0.175))
+    simulated = simulate("small", pole, seed=1)
+    result = run(simulated.image, simulated.track, COARSE)
+    assert result.verdict in ("object", "undecided")
+    assert max(map(abs, result.target.position_m)) < 0.1
+    if result.verdict == "undecided":
+        assert "a candidate at" in result.quality.reasons[0]
+
+
+def test_a_body_with_gaps_is_no_sediment():
+    frame = simulate("tiny", "frame", seed=3, position_m=PLACE)
+    search = search_image(frame.image, frame.track, Spectrum.of_image(frame.image))
+    assert search.best.stands
+    assert search.left_out == ()
+
+
+def test_a_strong_candidate_makes_no_object_undecided_and_a_weak_one_does_not():
+    weak, strong = LeftOut((1.0, 2.0), "sediment"), LeftOut((3.0, -4.0), "too low to tell", strong=True)
+    result = Result(left_out=[weak])
+    judge(result)
+    assert (result.verdict, result.quality.verdict) == ("no object", "good")
+    result = Result(left_out=[weak, strong])
+    judge(result)
+    assert (result.verdict, result.quality.verdict) == ("undecided", "not trustworthy")
+    assert result.quality.reasons == ("a candidate at (3.00, -4.00) m: too low to tell",)
+
+
+def test_a_given_volume_that_holds_nothing_is_no_object():
+    target = decide(None, TargetParameters(target="given", size_m=(1.0, 1.0, 0.5))).target
+    result = Result(target=target, views_used=10)
+    judge(result)
+    assert result.verdict == "no object"
+    result = Result(target=Target((0.5, 0.0), (1.0, 1.0, 0.5), evidence=0.1), views_used=10)
+    judge(result)
+    assert result.verdict == "undecided"
