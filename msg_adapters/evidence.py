@@ -41,6 +41,8 @@ def _status(one: ViewEvidence) -> Status:
         "contrast": one.contrast,
         "estimated": bool(one.levels_estimated),
         "height_m": one.height_m,
+        "unexplained": one.unexplained,
+        "lit": one.lit,
     }
     return Status.of(str(int(one.stamp_ns)), values)
 
@@ -67,5 +69,7 @@ def evidence_from_msg(msg: Any) -> dict[int, ViewEvidence]:
             contrast=status.real("contrast"),
             levels_estimated=status.truth("estimated"),
             height_m=status.real("height_m"),
+            unexplained=status.real("unexplained") if "unexplained" in status else math.nan,
+            lit=status.real("lit") if "lit" in status else math.nan,
         )
     return found

@@ -284,6 +284,8 @@ def _object_values(one: ObjectResult) -> dict[str, Value]:
     if unknown := sorted(set(d.intervals) - set(_KEYS)):
         raise AdapterError(f"there is an interval of {quoted(unknown[0])}; expected of: {', '.join(_KEYS)}")
     values["views"] = int(one.views_used)
+    if math.isfinite(d.scatter_cells):
+        values["scatter_cells"] = d.scatter_cells
     return values | _grid_values(one.grid) | target_values(one.target, _TARGET)
 
 
@@ -355,4 +357,5 @@ def _dimensions_of(status: Status) -> Dimensions:
     plain: Mapping[str, float] = {
         name: status.real(key) for name, key in _KEYS.items() if not name.startswith("position")
     }
-    return Dimensions(position_m=(x, y), intervals=intervals, **plain)
+    scatter = status.real("scatter_cells") if "scatter_cells" in status else math.nan
+    return Dimensions(position_m=(x, y), intervals=intervals, scatter_cells=scatter, **plain)

@@ -16,7 +16,7 @@ echo can cover; the others are seabed, and carve what the first look left standi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from .echo import echo_zone, opaque_part
 from .errors import ParameterError, ViewError
-from .explained import count_shadow_pixels, unexplained_shadow
+from .explained import ShadowFit, count_shadow_pixels, shadow_fit, unexplained_shadow
 from .geometry import View, ViewInfo
 from .kernels import kernel
 from .masks import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, KeptMask
@@ -548,6 +548,22 @@ class Carver:
             keep[k] |= keep[k + 1] & fuller.occupied[k]
         likelihood = np.where(keep, fuller.likelihood, np.fmax(leaner.likelihood, fuller.likelihood))
         return thresholded(self.volume, likelihood, fuller.views, self.parameters)
+
+    def shadow_fits(self, grids: Sequence[VoxelGrid]) -> dict[int, ShadowFit]:
+        """Compare the silhouettes that were carved with to bodies' shadows, the own one's first, by stamp.
+
+        Empty for methods that keep no silhouettes (soft, hard).
+        """
+        seabed = grids[0].seabed
+
+        def fit(kept: KeptMask) -> ShadowFit:
+            mask = kept.view()
+            if seabed is not None:
+                mask = replace(mask, info=seabed.corrected(mask.info))
+            return shadow_fit(mask, grids)
+
+        found = in_order(lambda item: fit(item[1]), self._masks.items(), _LOOKERS)
+        return {stamp: one for (stamp, _), one in found}
 
     def first_look(self) -> VoxelGrid:
         """Threshold what has been carved so far, covered pixels unknown: what `grid` starts from."""

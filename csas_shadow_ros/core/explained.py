@@ -1,13 +1,15 @@
 """Which of the segmented shadow a carved body explains: its own shadow, cast back into the views.
 
 A body is a set of voxels; P · X of each is the pixel that it darkens. Dark pixels of the target's silhouette
-that no voxel of it darkens are unexplained. They say that the body lacks something, and which voxels would
-supply it: those that darken them.
+that no voxel of it darkens are unexplained: the body lacks something, and the voxels that would supply it are
+those that darken them. Pixels that it darkens and that are lit say that it has too much.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -15,8 +17,8 @@ from numpy.typing import NDArray
 
 from .geometry import View
 from .kernels import kernel
-from .masks import MASK_SHADOW
-from .volume import Volume
+from .masks import MASK_OUTSIDE, MASK_SHADOW
+from .volume import Volume, VoxelGrid
 
 BoolArray = NDArray[np.bool_]
 
@@ -71,6 +73,55 @@ def _count(
             counts[m] += marked[v, u]
 
 
+@dataclass(frozen=True)
+class ShadowFit:
+    """How a body's shadow fits the segmented one of a view.
+
+    Parameters
+    ----------
+    unexplained : float
+        Share of the segmented shadow that lies clear of the cast one; NaN where none was segmented.
+    lit : float
+        Share of the cast shadow that is lit seabed, clear of the segmented one; NaN where none is cast.
+    """
+
+    unexplained: float
+    lit: float
+
+
+def cast_shadow(mask: View, volume: Volume, occupied: BoolArray) -> BoolArray:
+    """Mark the pixels of a view that the shadow of a body falls on.
+
+    Parameters
+    ----------
+    mask : View
+        The view.
+    volume : Volume
+        The body's lattice.
+    occupied : ndarray of bool, shape (nz, ny, nx)
+        The body.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+    """
+    cast = np.zeros(mask.info.camera.shape, np.bool_)
+    affines = mask.info.camera.height_slice_affines(volume.z_m)
+    x0, y0, _ = volume.origin_m
+    _cast(np.ascontiguousarray(occupied), affines, x0, y0, volume.voxel_size_m, cast)
+    return cast
+
+
+def _about(pixels: BoolArray, mask: View) -> BoolArray:
+    """Extend pixels by what a silhouette's edge is rough."""
+    rows, cols = (
+        math.ceil(_ROUGH_CELLS * cell / spacing)
+        for cell, spacing in zip(mask.info.resolution_m, mask.info.camera.spacing_m, strict=True)
+    )
+    box = np.ones((2 * rows + 1, 2 * cols + 1), np.uint8)
+    return np.asarray(cv2.dilate(pixels.view(np.uint8), box).view(np.bool_))
+
+
 def unexplained_shadow(mask: View, volume: Volume, occupied: BoolArray) -> BoolArray:
     """Mark the segmented shadow of a view that a body does not cast.
 
@@ -87,17 +138,29 @@ def unexplained_shadow(mask: View, volume: Volume, occupied: BoolArray) -> BoolA
     -------
     ndarray of bool, shape (rows, cols)
     """
-    info = mask.info
-    cast = np.zeros(info.camera.shape, np.bool_)
-    affines = info.camera.height_slice_affines(volume.z_m)
-    x0, y0, _ = volume.origin_m
-    _cast(np.ascontiguousarray(occupied), affines, x0, y0, volume.voxel_size_m, cast)
-    rows, cols = (
-        math.ceil(_ROUGH_CELLS * cell / spacing)
-        for cell, spacing in zip(info.resolution_m, info.camera.spacing_m, strict=True)
-    )
-    about = cv2.dilate(cast.view(np.uint8), np.ones((2 * rows + 1, 2 * cols + 1), np.uint8)).view(np.bool_)
-    return np.asarray((mask.pixels == MASK_SHADOW) & ~about)
+    return np.asarray((mask.pixels == MASK_SHADOW) & ~_about(cast_shadow(mask, volume, occupied), mask))
+
+
+def shadow_fit(mask: View, grids: Sequence[VoxelGrid]) -> ShadowFit:
+    """Compare the segmented shadow with what the bodies of a scene cast.
+
+    Parameters
+    ----------
+    mask : View
+        Shadow mask of the first body, shape (rows, cols); shadows of others that touch its own may be in it.
+    grids : sequence of VoxelGrid
+        The bodies.
+    """
+    dark = np.asarray(mask.pixels == MASK_SHADOW)
+    own, *others = (cast_shadow(mask, grid.volume, grid.occupied) for grid in grids)
+    lit = own & (mask.pixels == MASK_OUTSIDE) & ~_about(dark, mask)
+    cast = np.logical_or.reduce([own, *others])
+    return ShadowFit(_share(dark & ~_about(cast, mask), dark), _share(lit, own))
+
+
+def _share(part: BoolArray, whole: BoolArray) -> float:
+    count = int(np.count_nonzero(whole))
+    return float(np.count_nonzero(part)) / count if count else math.nan
 
 
 def count_shadow_pixels(

@@ -123,6 +123,8 @@ class SilhouetteSides:
         to tell); empty where nobody looked.
     support_by_shape_m : tuple of tuple of float
         The support of each side if it is of each of `SHAPES`, m; NaN where it cannot be.
+    cut : bool
+        Whether the shadow goes on where the view knows nothing: off the image.
     """
 
     info: ViewInfo
@@ -131,6 +133,7 @@ class SilhouetteSides:
     tip_m: float
     shapes: tuple[str, ...] = ()
     support_by_shape_m: tuple[tuple[float, ...], ...] = ()
+    cut: bool = False
 
 
 def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) -> SilhouetteSides | None:
@@ -180,7 +183,11 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
         shapes.append(shape)
     tip = info.down_range_of_rows()[rows[-1]] + row_m / 2.0
     own = tuple(each[SHAPES.index(shape)] for each, shape in zip(supports, shapes, strict=True))
-    return SilhouetteSides(info, tuple(directions), own, float(tip), tuple(shapes), tuple(supports))
+    beyond_tip = rows[-1] + 1
+    cut = beyond_tip == len(shadow) or not levels.known[beyond_tip, shadow[rows[-1]]].all()
+    return SilhouetteSides(
+        info, tuple(directions), own, float(tip), tuple(shapes), tuple(supports), bool(cut)
+    )
 
 
 def levels_of_mask(mask: View) -> Levels:
@@ -647,7 +654,7 @@ def measure_object(
     # A surface that lies wrong by one error everywhere.
     change = float(mesh.area) * math.hypot(edge / 2.0, d / 4.0)
     intervals["volume_m3"] = (max(0.0, whole.volume_m3 - change), whole.volume_m3 + change)
-    return replace(measured, height_m=height, intervals=intervals)
+    return replace(measured, height_m=height, intervals=intervals, scatter_cells=fit.spread_m / across)
 
 
 def _resampled(fit: PlanFit, sides: Sequence[SilhouetteSides], seed: int) -> list[_Rectangle]:

@@ -218,6 +218,8 @@ class Dimensions:
     intervals : mapping of str to (float, float)
         95 % interval of each measure by its name (``position_x_m`` and ``position_y_m`` for the position);
         empty where there are none.
+    scatter_cells : float
+        How far the sides of shadows scatter about one plan, 1σ, cross-range cells; NaN where none was fitted.
     """
 
     length_m: float
@@ -228,6 +230,7 @@ class Dimensions:
     position_m: tuple[float, float]
     hull_top_m: float = math.nan
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    scatter_cells: float = math.nan
 
     def __repr__(self) -> str:
         x, y = self.position_m
@@ -262,6 +265,7 @@ class Dimensions:
             heading_rad=round(self.heading_rad, 4) % math.pi,
             position_m=(length(self.position_m[0]), length(self.position_m[1])),
             hull_top_m=length(self.hull_top_m),
+            scatter_cells=round(self.scatter_cells, 3),
             intervals={name: (of(name, low), of(name, high)) for name, (low, high) in self.intervals.items()},
         )
 

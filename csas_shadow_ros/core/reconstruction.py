@@ -394,6 +394,10 @@ class Reconstruction:
             for body in self.bodies[1:]:
                 self._add_objects(result, body)
             result.timings_s["objects"] = time.perf_counter() - since
+        if final and result.objects and self.stamps:
+            since = time.perf_counter()
+            self._compare_shadows(result)
+            result.timings_s["compare"] = time.perf_counter() - since
         judge(result)
         return result
 
@@ -413,8 +417,24 @@ class Reconstruction:
             level, contrast, estimated = body.levels.get(stamp, (math.nan, math.nan, False))
             x, y, z = map(float, info.camera.sonar_m)
             result.evidence[stamp] = ViewEvidence(
-                stamp, info.aspect_rad, (x, y, z), level, contrast, estimated, heights.get(stamp, math.nan)
+                stamp,
+                info.aspect_rad,
+                (x, y, z),
+                level,
+                contrast,
+                estimated,
+                heights.get(stamp, math.nan),
             )
+
+    def _compare_shadows(self, result: Result) -> None:
+        """Note of each view how well what was found explains its shadow."""
+        if result.grid is None:
+            return
+        grids = [result.grid, *(one.grid for one in result.further)]
+        for stamp, fit in self.bodies[0].carver.shadow_fits(grids).items():
+            if stamp in result.evidence:
+                told = replace(result.evidence[stamp], unexplained=fit.unexplained, lit=fit.lit)
+                result.evidence[stamp] = told
 
     @staticmethod
     def _open_hollows(result: Result, matter: NDArray[np.bool_]) -> None:

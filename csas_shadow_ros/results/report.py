@@ -23,7 +23,7 @@ from ..core.geometry import CoherentImage, Track
 from ..core.mesh import Dimensions
 from ..core.parameters import CarvingParameters, PipelineParameters
 from ..core.shape.result import Result, ViewEvidence
-from ..core.shape.verdict import no_object_reason
+from ..core.shape.verdict import explained_share, no_object_reason
 from ..core.threshold import thresholded
 from ..core.volume import VoxelGrid
 from .truth import KnownTruth, TruthError, read_truth
@@ -232,6 +232,8 @@ def _shadow_heights(result: Result) -> dict[str, Any] | None:
                 "aspect_deg": math.degrees(one.aspect_rad) % 360.0,
                 "stamp_ns": one.stamp_ns,
                 "height_m": one.height_m,
+                "unexplained": one.unexplained,
+                "lit": one.lit,
             }
             for one in told
         ],
@@ -325,7 +327,11 @@ def build_report(
         "format": FORMAT,
         "object": found,
         "verdict": result.verdict,
-        "quality": {"verdict": result.quality.verdict, "reasons": list(result.quality.reasons)},
+        "quality": {
+            "verdict": result.quality.verdict,
+            "reasons": list(result.quality.reasons),
+            "explained": explained_share(result),
+        },
         "why_no_object": part("why_no_object", lambda: None if result.objects else no_object_reason(result)),
         "run": result.run_ns,
         "arc_deg": math.degrees(result.arc_rad),

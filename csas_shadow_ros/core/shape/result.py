@@ -66,6 +66,10 @@ class ViewEvidence:
         Whether the shadow's level was measured in the view (otherwise the contrast hypothesis).
     height_m : float
         Height that the length of its shadow implies; NaN where there is no shadow or no object.
+    unexplained : float
+        Share of its segmented shadow that the object's own lies clear of; NaN where nobody compared them.
+    lit : float
+        Share of the object's shadow that is lit seabed in the view; NaN likewise.
     """
 
     stamp_ns: int
@@ -75,6 +79,8 @@ class ViewEvidence:
     contrast: float = math.nan
     levels_estimated: bool = False
     height_m: float = math.nan
+    unexplained: float = math.nan
+    lit: float = math.nan
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,18 @@ _WHOLE_ARC = 0.75
 #: a voxel that 3 % of its views contradict, so losing a tenth of them hardly moves an edge; a gap in the
 #: circle is told by the arc as well.
 _MOST_REJECTED = 0.1
+#: Segmented shadow that what was found does not cast (share, mean over the views), above which a result is
+#: limited, and above which it is not to be trusted. Right shapes leave 0.2 to 2.5 % (shapes of
+#: `benchmarks/population.py`, 8 to 15 dB), one of two bodies whose shadows touch leaves 45 %.
+_UNEXPLAINED, _MOST_UNEXPLAINED = 0.1, 0.25
+#: Likewise of the shadow that it casts and that is lit in the views: 0 to 0.2 % for right shapes.
+_LIT, _MOST_LIT = 0.05, 0.15
+#: Sides that scatter about one plan by more than this (1σ, cross-range cells) disagree from view to view:
+#: right shapes 0.2 to 0.6, a vehicle whose views are shifted against each other 1.8 (docs/examples.md).
+_SCATTER_CELLS = 1.0
+#: Shadows that leave the image in more than this share of the views make heights too low (half of the views
+#: in a consensus of 3 % would do; a tenth is where the first heights by view are lost).
+_MOST_CUT = 0.1
 
 
 def judge(result: Result) -> None:
@@ -45,6 +57,12 @@ def judge(result: Result) -> None:
         reasons += _candidates(result)
         if reasons:
             result.verdict, worst = "undecided", 2
+    cut, told = sum(side.cut for side in result.sides), len(result.sides)
+    if told and cut > _MOST_CUT * told:
+        reasons.append(f"the shadow leaves the image in {cut} of {told} views; expected a larger image")
+        worst = max(worst, 1)
+        if result.verdict == "no object" and cut > 0.5 * told:
+            result.verdict, worst = "undecided", 2
     if result.mesh is not None and result.grid is not None:
         for side in cut_sides(result.grid):
             reasons.append(f"the carved volume cuts the object at its {side}")
@@ -57,6 +75,7 @@ def judge(result: Result) -> None:
         if refused > _MOST_REJECTED * (refused + result.views_used):
             reasons.append(f"{refused} of {refused + result.views_used} views were not used: {first}")
             worst = max(worst, 1)
+        worst = max(worst, _fit_of(result, reasons))
         if result.final and result.dimensions is not None and not result.dimensions.intervals:
             reasons.append("too few sides of shadows were seen for intervals")
             worst = max(worst, 1)
@@ -80,6 +99,40 @@ def _candidates(result: Result) -> list[str]:
             " a one to carve with single views; finer resolution or more contrast was needed",
         )
     return found
+
+
+def _fit_of(result: Result, reasons: list[str]) -> int:
+    """Say where what was found does not fit the views, and how bad that is: 0, 1 or 2."""
+    worst = 0
+    unexplained, lit = (
+        _mean([getattr(one, name) for one in result.evidence.values()]) for name in ("unexplained", "lit")
+    )
+    for share, some, most, text in (
+        (unexplained, _UNEXPLAINED, _MOST_UNEXPLAINED, "of the shadow is not explained by what was found"),
+        (lit, _LIT, _MOST_LIT, "of the shadow that it would cast is lit in the views"),
+    ):
+        if share > some:
+            reasons.append(f"{100.0 * share:.0f} % {text}")
+            worst = max(worst, 2 if share > most else 1)
+    scatter = math.nan if result.dimensions is None else result.dimensions.scatter_cells
+    if scatter > _SCATTER_CELLS:
+        reasons.append(
+            f"the shadow's sides scatter by {scatter:.1f} cells about one plan: the views are shifted against"
+            " one another, or there are several bodies"
+        )
+        worst = max(worst, 1)
+    return worst
+
+
+def explained_share(result: Result) -> float | None:
+    """Return how much of the segmented shadow what was found casts, mean over the views; None if unknown."""
+    known = [one.unexplained for one in result.evidence.values() if math.isfinite(one.unexplained)]
+    return 1.0 - float(np.mean(known)) if known else None
+
+
+def _mean(values: list[float]) -> float:
+    known = [value for value in values if math.isfinite(value)]
+    return float(np.mean(known)) if known else 0.0
 
 
 def cut_sides(grid: VoxelGrid) -> list[str]:
