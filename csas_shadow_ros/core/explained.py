@@ -23,8 +23,9 @@ from .volume import Volume, VoxelGrid
 BoolArray = NDArray[np.bool_]
 
 #: Segmented shadow counts as unexplained where it lies more than this outside of the cast one (resolution
-#: cells): a silhouette's own edge is that rough. At half of it a measured vehicle (docs/examples.md) grows from
-#: 7.3 to 8.1 m of length (6.95 in truth); at double a slab under a table falls from 0.60 to 0.46 of its hull.
+#: cells): a silhouette's own edge is that rough. At half of it a measured vehicle (docs/examples.md) grows
+#: from 7.3 to 8.1 m of length (6.95 in truth); at double a slab under a table falls from 0.60 to 0.46 of its
+#: hull.
 _ROUGH_CELLS = 1.5
 
 
