@@ -64,6 +64,7 @@ from . import qos
 from .flow import Flow
 from .params import NODES, declare, from_overrides
 from .rivals import Rivals
+from .runtime.host import Host
 
 NAMESPACE = "csas"
 BEAT_S = 0.5
@@ -745,7 +746,7 @@ class Inlet:
 
     Parameters
     ----------
-    node : CsasNode
+    node : Host
         The node.
     stream : str
         Name of the stream.
@@ -763,7 +764,7 @@ class Inlet:
 
     def __init__(
         self,
-        node: CsasNode,
+        node: Host,
         stream: str,
         role: str,
         work: Callable[[Any, Any], str | None],
@@ -818,7 +819,7 @@ class Inlet:
         elif time.monotonic() - since_s <= patience_s:
             self.held.append((since_s, image, info))
         else:
-            self._refuse(stamp, info, f"{self.stream} stamped {stamp} ns: {reason}; it is not used")
+            self.refuse(stamp, info, f"{self.stream} stamped {stamp} ns: {reason}; it is not used")
 
     def _work_on(self, image: Any, info: Any) -> None:
         stamp = stamp_to_ns(image.header.stamp)
@@ -827,7 +828,7 @@ class Inlet:
         try:
             outcome = self._work(image, info)
         except CsasError as error:
-            self._refuse(stamp, info, str(error))
+            self.refuse(stamp, info, str(error))
             return
         self._seen[stamp] = None
         if len(self._seen) > 1 << 16:
@@ -835,7 +836,8 @@ class Inlet:
         if outcome is not None:
             self.report(stamp, outcome)
 
-    def _refuse(self, stamp: int, info: Any, reason: str) -> None:
+    def refuse(self, stamp: int, info: Any, reason: str) -> None:
+        """Count a view that cannot be used, name it, and tell the sources so."""
         self.node.reject(reason)
         self.report(stamp, REJECTED, reason, **self._aspect_of(info))
 
@@ -1047,13 +1049,13 @@ class ViewOutlet:
 
     Parameters
     ----------
-    node : CsasNode
+    node : Host
         The node.
     stream : str
         Name of the stream.
     """
 
-    def __init__(self, node: CsasNode, stream: str) -> None:
+    def __init__(self, node: Host, stream: str) -> None:
         self._node = node
         self._stream = stream
         kind = stream_of(stream)
@@ -1065,9 +1067,9 @@ class ViewOutlet:
         """Whether anybody takes the stream: what nobody takes need not even be made."""
         return bool(self._image.get_subscription_count() or self._info.get_subscription_count())
 
-    def send(self, view: View) -> None:
-        """Publish a view; its stamp goes out unchanged."""
-        image, info = view_to_msgs(self._node.messages, view, self._stream, trusted=True)
+    def send(self, view: View, *, trusted: bool = True) -> None:
+        """Publish a view; its stamp goes out unchanged. `trusted` as of `view_to_msgs`."""
+        image, info = view_to_msgs(self._node.messages, view, self._stream, trusted=trusted)
         self._info.publish(info)
         self._image.publish(image)
 

@@ -1,0 +1,60 @@
+"""What the parts of a node need of whatever they are parts of: a node of ours, or somebody else's."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from msg_adapters import RclpyMessages, ViewProgress
+
+
+class Host(Protocol):
+    """Whoever has inlets and outlets: `CsasNode`, and `csas_shadow_ros.client` within an outside node."""
+
+    #: Identifies the running process; a successor has another one.
+    instance: str
+    messages: RclpyMessages
+    counts: Counter[str]
+    inlets: list[Any]
+    #: What stops it from working; empty if nothing does.
+    error: str
+    #: Stamp of the target that it works for; empty: it needs none, or knows of none.
+    target_stamp: str
+
+    @property
+    def name(self) -> str:
+        """Name of the node."""
+
+    def publisher(self, topic: str, profile: Any) -> Any:
+        """Make a publisher of a topic of the contract."""
+
+    def subscribe(
+        self, topic: str, profile: Any, callback: Callable[[Any], None], *, raw: bool = False
+    ) -> Any:
+        """Subscribe to a topic of the contract; nothing that the callback raises ends the node."""
+
+    def unsubscribe(self, subscription: Any) -> None:
+        """Take a subscription back."""
+
+    def count_publishers(self, topic: str) -> int:
+        """Return how many publishers of a topic are known."""
+
+    def leave(self, inlet: Any) -> None:
+        """Say goodbye for one inlet."""
+
+    def reject(self, reason: str) -> None:
+        """Count and name something that cannot be used."""
+
+    def send_report(self, item: ViewProgress) -> None:
+        """Publish what became of a view."""
+
+    def now_ns(self) -> int:
+        """Return the node's time."""
+
+    def common_counts(self) -> dict[str, int]:
+        """Return the counts that every heartbeat carries."""
+
+    def state_values(self) -> dict[str, str]:
+        """Return what else is worth telling in the heartbeat."""

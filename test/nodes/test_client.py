@@ -1,0 +1,371 @@
+"""Outside classifiers as real processes beside, and within, a graph of real processes: no view is lost."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+import graph_of_nodes  # noqa: F401  (this machine alone, before rclpy makes a context)
+import rclpy
+from graph_of_nodes import VOXEL_M
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+
+from csas_shadow_ros.client import ViewSubscriber
+from csas_shadow_ros.core.errors import ParameterError
+from csas_shadow_ros.graph import Graph, free_domain_id, graph_environment, start_fork_server
+from csas_shadow_ros.nodes import qos
+from msg_adapters import Heartbeat, RclpyMessages, measurements_from_msg, progress_from_msg
+from msg_adapters.topics import TOPICS
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLE = ROOT / "examples" / "classifier.py"
+VIEWS = 72
+PATIENCE_S = 150.0
+
+
+class Live:
+    """A graph of processes that stays when the run is over, and what is heard of it."""
+
+    def __init__(self, graph: Graph, domain: int, folder: Path) -> None:
+        self.graph, self.folder = graph, folder
+        self.environment = {
+            k: v for k, v in graph_environment(domain, folder).items() if k != "CSAS_PARENT_PID"
+        }
+        self.environment["PYTHONUNBUFFERED"] = "1"
+        self.beats: dict[tuple[str, str], Heartbeat] = {}
+        #: (node, stream) -> stamp -> outcome, "rejected: why" where there is a reason.
+        self.reports: dict[tuple[str, str], dict[int, str]] = {}
+        self.measurements: Any = None
+        self.children: list[subprocess.Popen[bytes]] = []
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = rclpy.create_node("onlooker", context=self.context, namespace="csas")
+        kind = RclpyMessages().cls(TOPICS["progress"].type_name)
+        self.node.create_subscription(kind, "progress", self._hear, qos.REPORTS)
+        self.node.create_subscription(kind, "measurements", self._measured, qos.LATCHED)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def _hear(self, msg: Any) -> None:
+        item = progress_from_msg(msg)
+        key = (item.node, item.values.get("stream", item.values.get("input", "")))
+        if isinstance(item, Heartbeat):
+            self.beats[key] = item
+        else:
+            told = f"{item.outcome}: {item.reason}" if item.reason else item.outcome
+            self.reports.setdefault(key, {})[item.stamp_ns] = told
+
+    def _measured(self, msg: Any) -> None:
+        self.measurements = measurements_from_msg(msg)
+
+    def until(self, condition: Callable[[], bool], what: str) -> None:
+        end = time.monotonic() + PATIENCE_S
+        while not condition():
+            counts = {k: dict(b.counts) for k, b in self.beats.items()}
+            assert time.monotonic() < end, f"not within {PATIENCE_S:g} s: {what}\n{counts}\n{self.logs()}"
+            self.graph.watch()
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def logs(self) -> str:
+        return "\n".join(f"{p.name}: {p.read_text()[-600:]}" for p in self.folder.glob("*.log"))
+
+    def carved(self) -> int:
+        beat = self.beats.get(("voxel_carver", "shadow_mask")) or self.beats.get(("voxel_carver", "likelihood"))
+        return 0 if beat is None or not beat.counts["complete"] else beat.counts["views"]
+
+    def told(self, node: str, stream: str = "shadow") -> dict[int, str]:
+        return self.reports.get((node, stream), {})
+
+    def start(self, *command: object) -> Outside:
+        made = Outside(self, [str(c) for c in command], self.folder / f"outside_{len(self.children)}.log")
+        self.children.append(made.process)
+        return made
+
+    def close(self) -> None:
+        for process in self.children:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+        self.executor.shutdown(timeout_sec=1.0)
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+class Outside:
+    """A process of somebody else's; what it prints begins with the stamp of a view."""
+
+    def __init__(self, live: Live, command: Sequence[str], log: Path) -> None:
+        self.log = log
+        with log.open("wb") as output:
+            self.process = subprocess.Popen(
+                [sys.executable, *command], env=live.environment, stdout=output, stderr=subprocess.STDOUT
+            )
+
+    def stamps(self) -> list[str]:
+        return [s for s in re.findall(r"^([\d.]{10,}) ", self.log.read_text(), re.MULTILINE)]
+
+    def got(self, views: int) -> Callable[[], bool]:
+        return lambda: len(set(self.stamps())) >= views
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def end(self) -> None:
+        self.process.send_signal(signal.SIGINT)
+        assert self.process.wait(20.0) == 0, self.log.read_text()
+
+
+@pytest.fixture
+def live(run_bag: Path, tmp_path: Path) -> Iterator[Callable[..., Live]]:
+    with contextlib.ExitStack() as stack:
+
+        def make(**changes: dict[str, Any] | None) -> Live:
+            plan: dict[str, Any] = {
+                "bag_player": {"bag": str(run_bag)},
+                "sub_aperture": {"step_deg": 360.0 / VIEWS},
+                "shadow_enhancement": {},
+                "shadow_likelihood": {},
+                "voxel_carver": {"voxel_size_m": VOXEL_M},
+            }
+            for node, own in changes.items():
+                plan.pop(node) if own is None else plan[node].update(own)
+            domain = free_domain_id()
+            server = stack.enter_context(start_fork_server(domain, tmp_path))
+            graph = stack.enter_context(Graph(plan, domain, tmp_path, server=server))
+            made = Live(graph, domain, tmp_path)
+            stack.callback(made.close)
+            return made
+
+        yield make
+
+
+def program(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "outside.py"
+    path.write_text(textwrap.dedent(text), encoding="utf-8")
+    return path
+
+
+def page_program(tmp_path: Path) -> Path:
+    """The page's own program, word for word."""
+    page = (ROOT / "docs" / "flow_control.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert "csas_shadow_ros" not in code.replace("`csas_shadow_ros.client.spin`", ""), "it imports none of ours"
+    return program(tmp_path, code)
+
+
+@pytest.fixture(params=["example", "page"])
+def classifier(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    return EXAMPLE if request.param == "example" else page_program(tmp_path)
+
+
+def test_the_graph_completes_where_there_is_no_classifier_and_one_that_comes_after_the_end_gets_all_views(
+    live: Callable[..., Live], classifier: Path
+) -> None:
+    graph = live()
+    graph.until(lambda: graph.carved() == VIEWS, "the carver has all views")
+    late = graph.start(classifier, 0)
+    graph.until(late.got(VIEWS), "a late classifier has every view")
+    assert len(late.stamps()) == VIEWS, "each once"
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.5])
+def test_a_classifier_that_is_there_from_the_beginning_gets_all_views_however_slow_it_is(
+    live: Callable[..., Live], classifier: Path, seconds: float
+) -> None:
+    graph = live(sub_aperture={"min_sinks": 3})
+    outside = graph.start(classifier, seconds)
+    graph.until(outside.got(VIEWS), "the classifier has every view")
+    graph.until(lambda: graph.carved() == VIEWS, "the carver has every view")
+    assert len(outside.stamps()) == VIEWS, "each once"
+    node = "classifier" if classifier == EXAMPLE else "bare_classifier"
+    graph.until(lambda: len(graph.told(node)) == VIEWS, "every view is reported")
+    assert set(graph.told(node).values()) == {"integrated"}
+
+
+def test_a_classifier_that_is_killed_and_restarted_in_mid_run_gets_all_views_and_so_does_one_that_joins_then(
+    live: Callable[..., Live], classifier: Path
+) -> None:
+    graph = live(sub_aperture={"min_sinks": 3})
+    first = graph.start(classifier, 0.2)
+    graph.until(first.got(15), "it is mid-run")
+    first.kill()
+    assert len(set(first.stamps())) < VIEWS
+    second = graph.start(classifier, 0)
+    graph.until(second.got(VIEWS), "the successor has every view")
+    graph.until(lambda: graph.carved() == VIEWS, "the carver has every view")
+    assert len(second.stamps()) == VIEWS, "each once"
+
+
+def test_a_classifier_that_joins_in_mid_run_gets_all_views(
+    live: Callable[..., Live], classifier: Path, tmp_path: Path
+) -> None:
+    graph = live(sub_aperture={"min_sinks": 3})
+    slow = graph.start(EXAMPLE, 0.2)
+    graph.until(slow.got(15), "it is mid-run")
+    other = classifier.read_text(encoding="utf-8").replace('create_node("', 'create_node("other_')
+    other = other.replace('name="bare', 'name="other_bare')
+    late = graph.start(program(tmp_path, other), 0)
+    graph.until(late.got(VIEWS), "the one that joined has every view")
+    graph.until(slow.got(VIEWS), "the slow one has every view")
+
+
+def test_a_classifier_that_is_ended_in_order_says_goodbye_and_nobody_waits_for_it(
+    live: Callable[..., Live],
+) -> None:
+    graph = live(sub_aperture={"min_sinks": 3, "sink_wait_s": 86400.0})
+    outside = graph.start(EXAMPLE, 0.2)
+    graph.until(outside.got(10), "it is mid-run")
+    outside.end()
+    assert len(outside.stamps()) < VIEWS
+    graph.until(lambda: graph.carved() == VIEWS, "the run ends without it")
+    assert graph.beats["classifier", "shadow"].values["leaving"] == "true"
+
+
+#: Takes the place of `shadow_likelihood`; refuses every ninth view in one way, and every ninth in another.
+STAGE = """
+    import sys
+    import numpy as np
+    import rclpy
+    from csas_shadow_ros.client import ViewSubscriber, spin
+
+    count = 0
+
+    def classify(pixels, info):
+        global count
+        count += 1
+        print(f"{info.stamp_ns} classified", flush=True)
+        if REFUSE and info.stamp_ns % 9 == 0:
+            return "too few pixels"
+        if REFUSE and info.stamp_ns % 9 == 1:
+            raise ValueError("network is out of memory")
+        dark = pixels < 0.35 * np.median(pixels)
+        return dark if sys.argv[1] == "shadow_mask" else np.where(dark, 0.1, 0.9)
+
+    rclpy.init()
+    node = rclpy.create_node("network", namespace="csas")
+    with ViewSubscriber(node, "shadow", classify, results=sys.argv[1]):
+        spin(node)
+"""
+
+
+@pytest.mark.parametrize("stream", ["shadow_mask", "likelihood"])
+def test_the_results_of_an_outside_stage_are_carved_and_the_graph_completes_though_it_is_killed(
+    live: Callable[..., Live], tmp_path: Path, stream: str
+) -> None:
+    method = "consensus" if stream == "shadow_mask" else "soft"
+    graph = live(shadow_likelihood=None, voxel_carver={"method": method})
+    path = program(tmp_path, STAGE.replace("REFUSE", "False"))
+    first = graph.start(path, stream)
+    graph.until(first.got(1), "it has begun")
+    first.kill()
+    second = graph.start(path, stream)
+    graph.until(lambda: graph.carved() == VIEWS, "the carver has every view")
+    graph.until(lambda: graph.measurements is not None and graph.measurements.run.final, "there is a result")
+    assert len({*first.stamps(), *second.stamps()}) == VIEWS
+    assert len(graph.told("network")) == VIEWS
+    assert set(graph.told("network").values()) == {"published"}
+
+
+def test_views_that_an_outside_stage_refuses_or_fails_at_are_named_and_nobody_waits_for_them(
+    live: Callable[..., Live], tmp_path: Path
+) -> None:
+    graph = live(shadow_likelihood=None)
+    # By the stamps that there are: how many each way of refusing meets is counted below.
+    text = STAGE.replace("REFUSE", "True").replace("info.stamp_ns % 9", "round(info.aspect_rad * 1e6) % 9")
+    graph.start(program(tmp_path, text), "shadow_mask")
+    graph.until(lambda: len(graph.told("network")) == VIEWS, "every view is reported")
+    told = list(graph.told("network").values())
+    refused = told.count("rejected: too few pixels"), told.count("rejected: ValueError: network is out of memory")
+    assert min(refused) > 0
+    graph.until(lambda: graph.carved() == VIEWS - sum(refused), "the carver has all others, and ends")
+
+
+def test_what_cannot_be_subscribed_to_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r"stream is 'image'; expected one of: sub_aperture, shadow"):
+        ViewSubscriber(None, "image", lambda *_: None)
+    with pytest.raises(ParameterError, match=r"results is 'shadow_mask'; expected one of the streams behind"):
+        ViewSubscriber(None, "likelihood", lambda *_: None, results="shadow_mask")
+
+
+def in_one_process(callback: Callable[..., Any], views: Sequence[Any], results: str | None = None) -> list[Any]:
+    """Publish views to a subscriber in this process; return what it reports."""
+    from csas_shadow_ros.core.geometry import View
+    from msg_adapters import view_to_msgs
+
+    messages, context, told = RclpyMessages(), Context(), []
+    rclpy.init(context=context, domain_id=free_domain_id())
+    node = rclpy.create_node("classifier", context=context, namespace="csas")
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    image = node.create_publisher(messages.cls(TOPICS["shadow/image"].type_name), "shadow/image", qos.VIEWS)
+    info = node.create_publisher(
+        messages.cls(TOPICS["shadow/camera_info"].type_name), "shadow/camera_info", qos.VIEWS
+    )
+    kind = messages.cls(TOPICS["progress"].type_name)
+    node.create_subscription(kind, "progress", lambda m: told.append(progress_from_msg(m)), qos.REPORTS)
+
+    def spin(done: Callable[[], bool]) -> None:
+        end = time.monotonic() + 30.0
+        while not done():
+            assert time.monotonic() < end, told
+            executor.spin_once(timeout_sec=0.05)
+
+    try:
+        with ViewSubscriber(node, "shadow", callback, results=results) as made:
+            assert isinstance(views[0], View)
+            spin(lambda: image.get_subscription_count() > 0 and info.get_subscription_count() > 0)
+            for number, view in enumerate(views, start=1):
+                picture, camera = view_to_msgs(messages, view, "shadow")
+                image.publish(picture)
+                info.publish(camera)
+                spin(lambda n=number: sum(not isinstance(t, Heartbeat) for t in told) >= n)
+            made.close()
+        spin(lambda: isinstance(told[-1], Heartbeat) and told[-1].values.get("leaving") == "true")
+        return [t for t in told if not isinstance(t, Heartbeat)]
+    finally:
+        executor.shutdown(timeout_sec=1.0)
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def test_a_view_that_comes_again_is_reported_again_and_not_classified_again(reference: Any) -> None:
+    views = [v.shadow for v in reference[1][:2]]
+    seen: list[int] = []
+    told = in_one_process(lambda _, info: seen.append(info.stamp_ns), [views[0], views[1], views[0]])
+    assert seen == [v.info.stamp_ns for v in views]
+    assert [t.stamp_ns for t in told] == [views[n].info.stamp_ns for n in (0, 1, 0)]
+    assert [t.outcome for t in told] == ["integrated"] * 3
+
+
+@pytest.mark.parametrize(
+    ("answer", "results", "reason"),
+    [
+        (lambda p, _: p, None, "TypeError: callback returned ndarray; expected None or a reason"),
+        (lambda *_: None, "likelihood", "callback returned NoneType; expected the result's pixels"),
+        (lambda p, _: p[:-1] < 0, "shadow_mask", "view has "),
+        (lambda p, _: p.astype(np.float32) * 0 + 2, "likelihood", "likelihood/image"),
+        (lambda p, _: p, "shadow_mask", "TypeError: Cannot cast"),
+    ],
+)
+def test_what_a_callback_must_not_return_refuses_the_view_with_a_line_that_says_so(
+    reference: Any, answer: Callable[..., Any], results: str | None, reason: str
+) -> None:
+    (told,) = in_one_process(answer, [reference[1][0].shadow], results)
+    assert told.outcome == "rejected"
+    assert reason in told.reason
