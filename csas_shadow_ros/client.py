@@ -20,6 +20,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.signals import uninstall_signal_handlers
 
+from csas_shadow_ros.core.carving import MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from csas_shadow_ros.core.errors import CsasError, ParameterError
 from csas_shadow_ros.core.geometry import View, ViewInfo, looks_at
 from msg_adapters import (
@@ -62,13 +63,14 @@ class ViewSubscriber:
     stream : str
         `sub_aperture`, `shadow`, `likelihood` or `shadow_mask`.
     callback : callable
-        Takes (pixels, info), an ndarray of shape (rows, cols) and a `ViewInfo` (aspect, camera, stamp).
-        A text that it returns, or an exception that it raises, refuses the view for that reason. It runs in a thread
-        of its own, one view at a time.
+        Takes (pixels, info): an ndarray of shape (rows, cols), NaN where the view knows nothing, and a
+        `ViewInfo` (aspect, camera, stamp). A text that it returns, or an exception that it raises, refuses
+        the view for that reason. It runs in a thread of its own, one view at a time.
     results : str, optional
-        Stream that the callback's result goes out on: `likelihood` or `shadow_mask`, `shadow` of sub-apertures.
-        It must return the result's pixels then (bool masks become 255 and 0), and its node takes the place of the stage
-        that makes this stream. By default a view ends here.
+        Stream that the callback's results go out on: `likelihood` or `shadow_mask`; of sub-apertures `shadow`
+        too. It must return the result's pixels then (of a bool mask True is shadow, and unknown is where the
+        view is NaN), and its node takes the place of the stage that makes this stream. By default a view
+        ends here.
 
     Raises
     ------
@@ -77,8 +79,8 @@ class ViewSubscriber:
 
     Notes
     -----
-    Without `results` the callback is called once with each view in the life of the process: what a successor knows it has
-    to be told again. With `results` it may be called with one again, whose result was lost behind it.
+    Without `results` the callback is called once with each view in the life of the process: a successor has
+    to be told everything again. With `results` it is called again with a view whose result was lost behind it.
 
     Examples
     --------
@@ -99,7 +101,8 @@ class ViewSubscriber:
         later = [name for name in VIEW_STREAMS if place_of(name) > place_of(stream)]
         if results is not None and results not in later:
             raise ParameterError(
-                f"results is {results!r}; expected one of the streams behind {stream}: {', '.join(later) or 'none'}"
+                f"results is {results!r}; expected one of the streams behind {stream}:"
+                f" {', '.join(later) or 'there is none'}"
             )
         self._callback = callback
         self._stream = stream
@@ -126,7 +129,7 @@ class ViewSubscriber:
         return dict(self._host.counts)
 
     def close(self) -> None:
-        """Finish the view that is worked on, and say goodbye, so that nobody waits; again: nothing happens."""
+        """Finish the view that is worked on, and say goodbye, so that nobody waits."""
         with self._wake:
             self._closed = True
             self._wake.notify()
@@ -147,11 +150,11 @@ class ViewSubscriber:
         self._host.target_stamp = str(stamp_to_ns(msg.header.stamp, "target.header.stamp"))
 
     def _enqueue(self, image: Any, info: Any) -> None:
-        """Keep a view for the callback; a window of them at most, and of one that comes again the newer copy."""
+        """Keep a view for the callback: a window of them at most, the newer one of two copies."""
         with self._wake:
             stamp = stamp_to_ns(image.header.stamp)
             if self._waiting.pop(stamp, None) is None and len(self._waiting) >= qos.MAX_WINDOW:
-                return  # of an earlier source, which is told nothing: whoever misses it sends it again
+                return  # more than any source has on its way; not reported, so it is sent again
             self._waiting[stamp] = (image, info)
             self._wake.notify()
 
@@ -191,7 +194,7 @@ class ViewSubscriber:
             self._inlet.report(stamp, outcome)
 
     def _ask(self, image: Any, info: Any) -> tuple[str, str] | None:
-        """Call back; return (outcome, reason), None if the view is of a target that is no longer looked at."""
+        """Call back; return (outcome, reason), None for a view of a target that has moved since."""
         try:
             view = view_from_msgs(image, info, self._stream)
             if self._outdated(view.info):
@@ -205,7 +208,7 @@ class ViewSubscriber:
                 if answer is not None:
                     raise TypeError(f"callback returned {type(answer).__name__}; expected None or a reason")
                 return INTEGRATED, ""
-            self._outlet.send(self._result(answer, view.info), trusted=False)
+            self._outlet.send(self._result(answer, view), trusted=False)
             return PUBLISHED, ""
         except CsasError as error:
             return REJECTED, str(error)
@@ -218,13 +221,15 @@ class ViewSubscriber:
     def _outdated(self, info: ViewInfo) -> bool:
         return self._target is not None and not looks_at(info, self._target.centre_m[:2])
 
-    def _result(self, answer: Answer, info: ViewInfo) -> View:
+    def _result(self, answer: Answer, view: View) -> View:
         if not isinstance(answer, np.ndarray):
-            raise TypeError(f"callback returned {type(answer).__name__}; expected the result's pixels, or a reason")
+            what = type(answer).__name__
+            raise TypeError(f"callback returned {what}; expected the result's pixels or a reason")
         if answer.dtype == np.bool_ and self._results == "shadow_mask":
-            answer = np.where(answer, np.uint8(255), np.uint8(0))
+            answer = np.where(answer, np.uint8(MASK_SHADOW), np.uint8(MASK_OUTSIDE))
+            answer[np.isnan(view.pixels)] = MASK_UNKNOWN
         wanted = np.uint8 if self._results == "shadow_mask" else np.float32
-        return View(info, np.ascontiguousarray(answer.astype(wanted, casting="same_kind", copy=False)))
+        return View(view.info, np.ascontiguousarray(answer.astype(wanted, casting="same_kind", copy=False)))
 
     # In the heartbeats' thread
 
@@ -352,8 +357,8 @@ class _Host:
 def spin(node: Any, timeout_s: float | None = None) -> None:
     """Spin a node until SIGINT or SIGTERM, and leave it able to say goodbye.
 
-    ``rclpy.spin`` does as well, but on Ctrl-C rclpy cuts the node off first: the graph then waits for it as for one
-    that was killed. Call it from the main thread.
+    ``rclpy.spin`` does as well, but on Ctrl-C rclpy cuts the node off first: the graph then waits for it as
+    for one that was killed. Call it from the main thread.
 
     Parameters
     ----------

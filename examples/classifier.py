@@ -15,7 +15,7 @@ SECONDS_A_VIEW = float(sys.argv[1]) if len(sys.argv) > 1 else 0.0
 def classify(pixels, info):
     """Say how much of a view is dark."""
     time.sleep(SECONDS_A_VIEW)  # what a network would take
-    dark = np.mean(pixels < 0.3 * np.median(pixels))
+    dark = np.mean(pixels[np.isfinite(pixels)] < 0.3 * np.nanmedian(pixels))
     print(f"{info.stamp_ns} {math.degrees(info.aspect_rad):6.1f}° {dark:4.0%} dark", flush=True)
 
 
