@@ -80,7 +80,8 @@ class ViewSubscriber:
     Notes
     -----
     Without `results` the callback is called once with each view in the life of the process: a successor has
-    to be told everything again. With `results` it is called again with a view whose result was lost behind it.
+    to be told everything again. With `results` it is called again with a view whose result was lost
+    behind it.
 
     Examples
     --------
