@@ -228,7 +228,8 @@ class ViewSubscriber:
             raise TypeError(f"callback returned {what}; expected the result's pixels or a reason")
         if answer.dtype == np.bool_ and self._results == "shadow_mask":
             answer = np.where(answer, np.uint8(MASK_SHADOW), np.uint8(MASK_OUTSIDE))
-            answer[np.isnan(view.pixels)] = MASK_UNKNOWN
+            if answer.shape == view.pixels.shape:  # others are refused below
+                answer[np.isnan(view.pixels)] = MASK_UNKNOWN
         wanted = np.uint8 if self._results == "shadow_mask" else np.float32
         return View(view.info, np.ascontiguousarray(answer.astype(wanted, casting="same_kind", copy=False)))
 
