@@ -20,7 +20,7 @@ from .camera_info import (
     view_info_to_msg,
 )
 from .evidence import evidence_from_msg, evidence_to_msg
-from .image import check_pixels, image_from_msg, image_to_msg, pixels_from_msg, quantise
+from .image import check_pixels, display_to_msg, image_from_msg, image_to_msg, pixels_from_msg, quantise
 from .measurements import (
     GridFacts,
     MeasuredObject,
@@ -122,6 +122,7 @@ __all__ = [
     "decision_from_msg",
     "decision_to_msg",
     "diagnostics_to_msg",
+    "display_to_msg",
     "evidence_from_msg",
     "evidence_to_msg",
     "ground_info_from_msg",

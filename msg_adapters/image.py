@@ -150,6 +150,24 @@ def image_from_msg(msg: Any, stream_name: str) -> NDArray[Any]:
     return pixels
 
 
+def display_to_msg(factory: MessageFactory, picture: NDArray[np.uint8], stamp_ns: int) -> Any:
+    """Make the Image (mono8) of a picture for the eye, shape (rows, cols)."""
+    if picture.ndim != 2 or picture.dtype != np.uint8:
+        raise AdapterError(
+            f"picture has shape {picture.shape} of {picture.dtype}; expected (rows, cols) of uint8"
+        )
+    return factory.make(
+        IMAGE,
+        header=make_header(factory, stamp_ns),
+        height=picture.shape[0],
+        width=picture.shape[1],
+        encoding="mono8",
+        is_bigendian=0,
+        step=picture.shape[1],
+        data=factory.octets(np.ascontiguousarray(picture)),
+    )
+
+
 def image_to_msg(
     factory: MessageFactory,
     pixels: NDArray[Any],

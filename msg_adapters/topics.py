@@ -206,6 +206,13 @@ def _topics() -> dict[str, Topic]:
             )
         )
     topics += [
+        Topic(
+            "shadow/display",
+            IMAGE,
+            "shadow/image for the eye: 1 to 255 is -25 to +15 dB over the view's median, 0 NaN; made while"
+            " somebody looks",
+            encodings=("mono8",),
+        ),
         Topic("track", PATH, "sonar poses along the circle, stamped, in csas_scene"),
         Topic("target", MARKER, "the carved volume as a CUBE; action DELETE: no object"),
         Topic("voxels", POINT_CLOUD, "voxels that may be object: x y z l_out views"),
@@ -228,6 +235,9 @@ def _topics() -> dict[str, Topic]:
 #: Every topic, by its name relative to the namespace.
 TOPICS: dict[str, Topic] = _topics()
 
+
+#: Pictures of other topics, for the eye: who records everything has those topics, and does without.
+DISPLAYS: frozenset[str] = frozenset({"shadow/display"})
 
 #: Of the other method's grid.
 OTHER_METHOD = "other_method"

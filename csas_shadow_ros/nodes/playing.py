@@ -16,7 +16,7 @@ from csas_shadow_ros.core.errors import BagError, CsasError, ParameterError
 from msg_adapters import TOPICS, VIEW_STREAMS
 from msg_adapters.camera_info import sector_info_from_msg
 from msg_adapters.messages import NANOSECONDS
-from msg_adapters.topics import MARKERS
+from msg_adapters.topics import DISPLAYS, MARKERS
 from msg_adapters.topics import stream as stream_of
 from msg_adapters.topics import topic as topic_of
 
@@ -75,7 +75,8 @@ def topics_to_record(topics: str) -> list[str]:
     ParameterError
         If one is not in the contract.
     """
-    names = list(TOPICS) if topics == "all" else [t.strip() for t in topics.split(",") if t.strip()]
+    everything = [name for name in TOPICS if name not in DISPLAYS]
+    names = everything if topics == "all" else [t.strip() for t in topics.split(",") if t.strip()]
     if unknown := [n for n in names if n not in TOPICS]:
         raise ParameterError(f"topics names {unknown[0]!r}; expected some of: {', '.join(TOPICS)}")
     return names

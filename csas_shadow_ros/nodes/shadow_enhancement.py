@@ -5,18 +5,20 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+from csas_shadow_ros.core.display import decibel_picture
 from csas_shadow_ros.core.errors import NoTargetError
 from csas_shadow_ros.core.parameters import PipelineParameters, ShadowParameters
 from csas_shadow_ros.core.pipeline import ProcessedView
 from csas_shadow_ros.core.warm import warm_enhancement
-from msg_adapters import view_from_msgs
+from msg_adapters import display_to_msg, view_from_msgs
 
+from . import qos
 from .base import PUBLISHED, CsasNode, Inlet, TargetInlet, ViewOutlet, run_node
 from .params import part
 
 
 class ShadowEnhancementNode(CsasNode):
-    """Takes `sub_aperture/*`, publishes `shadow/*`."""
+    """Takes `sub_aperture/*`, publishes `shadow/*`; pictures of it on `shadow/display` to those who look."""
 
     name = "shadow_enhancement"
 
@@ -24,6 +26,7 @@ class ShadowEnhancementNode(CsasNode):
         """Make the outlet before the inlet: what comes in can go out."""
         self.pipeline = PipelineParameters(shadow=part(self.parameters, ShadowParameters))
         self.shadow = ViewOutlet(self, "shadow")
+        self.display = self.publisher("shadow/display", qos.VIEWS)
         self.target = TargetInlet(self, lambda: self.inlet.release())
         self.inlet = Inlet(self, "sub_aperture", "stage", self.work, hold=self.target.hold)
 
@@ -42,7 +45,11 @@ class ShadowEnhancementNode(CsasNode):
         if self.target.target is None:
             raise NoTargetError("no target: topic target says that there is no object in the scene")
         made = ProcessedView(self.target.target, self.pipeline, sub_aperture=view)
-        self.shadow.send(made.require("shadow"))
+        shadow = made.require("shadow")
+        self.shadow.send(shadow)
+        if self.display.get_subscription_count():
+            picture = decibel_picture(shadow.pixels)
+            self.display.publish(display_to_msg(self.messages, picture, shadow.info.stamp_ns))
         return PUBLISHED
 
 
