@@ -20,9 +20,9 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.signals import uninstall_signal_handlers
 
-from csas_shadow_ros.core.carving import MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from csas_shadow_ros.core.errors import CsasError, ParameterError
 from csas_shadow_ros.core.geometry import View, ViewInfo, looks_at
+from csas_shadow_ros.core.masks import MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from msg_adapters import (
     VIEW_STREAMS,
     RclpyMessages,
@@ -252,7 +252,7 @@ class _Host:
         self.messages = RclpyMessages()
         self.counts: Counter[str] = Counter()
         self.inlets: list[Inlet] = []
-        self.error = self.target_stamp = ""
+        self.trouble = self.unable = self.target_stamp = ""
         self._look = look
         self._warned: set[str] = set()
         self._owned: list[tuple[Callable[[Any], Any], Any]] = []

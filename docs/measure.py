@@ -32,12 +32,13 @@ import trimesh
 from numpy.typing import NDArray
 
 from csas_shadow_ros.core import likelihood, measurement, reference, segmentation
-from csas_shadow_ros.core.carving import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, Carver
+from csas_shadow_ros.core.carving import Carver
 from csas_shadow_ros.core.echo import layover_per_metre
 from csas_shadow_ros.core.geometry import ShadowCamera, Track, View, ViewInfo
 from csas_shadow_ros.core.hollows import EchoLook, _looks, _surface
 from csas_shadow_ros.core.likelihood import Levels, box_mean
 from csas_shadow_ros.core.local_means import LocalMeans
+from csas_shadow_ros.core.masks import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from csas_shadow_ros.core.measurement import SilhouetteSides
 from csas_shadow_ros.core.mesh import measure
 from csas_shadow_ros.core.parameters import (

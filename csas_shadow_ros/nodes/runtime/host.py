@@ -18,14 +18,18 @@ class Host(Protocol):
     messages: RclpyMessages
     counts: Counter[str]
     inlets: list[Any]
-    #: What stops it from working; empty if nothing does.
-    error: str
+    #: Why it can take nothing for now; empty if it can.
+    unable: str
     #: Stamp of the target that it works for; empty: it needs none, or knows of none.
     target_stamp: str
 
     @property
     def name(self) -> str:
         """Name of the node."""
+
+    @property
+    def trouble(self) -> str:
+        """What stops it from working; empty if nothing does."""
 
     def publisher(self, topic: str, profile: Any) -> Any:
         """Make a publisher of a topic of the contract."""
