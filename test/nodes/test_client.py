@@ -26,7 +26,7 @@ from rclpy.executors import SingleThreadedExecutor
 
 from csas_shadow_ros.client import ViewSubscriber
 from csas_shadow_ros.core.errors import ParameterError
-from csas_shadow_ros.graph import Graph, free_domain_id, graph_environment, start_fork_server
+from csas_shadow_ros.graph import DomainReservation, Graph, graph_environment, start_fork_server
 from csas_shadow_ros.nodes import qos
 from msg_adapters import Heartbeat, RclpyMessages, measurements_from_msg, progress_from_msg
 from msg_adapters.topics import TOPICS
@@ -145,7 +145,7 @@ def live(run_bag: Path, tmp_path: Path) -> Iterator[Callable[..., Live]]:
             }
             for node, own in changes.items():
                 plan.pop(node) if own is None else plan[node].update(own)
-            domain = free_domain_id()
+            domain = stack.enter_context(DomainReservation())
             server = stack.enter_context(start_fork_server(domain, tmp_path))
             graph = stack.enter_context(Graph(plan, domain, tmp_path, server=server))
             made = Live(graph, domain, tmp_path)
@@ -322,7 +322,8 @@ def in_one_process(
     from msg_adapters import view_to_msgs
 
     messages, context, told = RclpyMessages(), Context(), []
-    rclpy.init(context=context, domain_id=free_domain_id())
+    reservation = DomainReservation()
+    rclpy.init(context=context, domain_id=reservation.domain_id)
     node = rclpy.create_node("classifier", context=context, namespace="csas")
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
@@ -355,6 +356,7 @@ def in_one_process(
         executor.shutdown(timeout_sec=1.0)
         node.destroy_node()
         rclpy.shutdown(context=context)
+        reservation.close()
 
 
 def test_a_view_that_comes_again_is_reported_again_and_not_classified_again(reference: Any) -> None:
