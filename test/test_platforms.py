@@ -44,7 +44,8 @@ def assigned(name: str) -> list[str]:
     for statement in ast.parse((ROOT / "setup.py").read_text()).body:
         targets = getattr(statement, "targets", [getattr(statement, "target", None)])
         if any(getattr(target, "id", "") == name for target in targets):
-            found += ast.literal_eval(statement.value)
+            value = statement.value
+            found += assigned(value.id) if isinstance(value, ast.Name) else ast.literal_eval(value)
     return found
 
 

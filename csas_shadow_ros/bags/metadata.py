@@ -98,6 +98,8 @@ def read_metadata(folder: Path) -> Metadata:
         information = _plain(yaml.load(data.decode(), Loader=_Loader)["rosbag2_bagfile_information"])
         files = [Path(name).name for name in information["relative_file_paths"]]
         count = information.get("message_count", 0)
+    except BagError:
+        raise
     except OSError as error:
         raise BagError(f"{path} cannot be read ({error.strerror})") from error
     except KeyError as error:

@@ -530,7 +530,7 @@ class Carver:
         leaner = lean.first_look()
         if leaner.occupied.any():
             leaner = lean._second_look(leaner)
-        voxels = np.argwhere(fuller.occupied & ~leaner.occupied).astype(np.int32)
+        voxels = np.ascontiguousarray(np.argwhere(fuller.occupied & ~leaner.occupied), np.int32)
         if not len(voxels):
             return fuller
         asked = np.zeros(len(voxels), np.int32)

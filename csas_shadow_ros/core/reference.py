@@ -19,7 +19,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from .geometry import CoherentImage, ShadowCamera, View, down_range_axis, unit_to_sonar
+from .geometry import CoherentImage, ShadowCamera, View, ViewInfo, down_range_axis, unit_to_sonar
 from .volume import Volume
 
 #: Values of a silhouette: lit seabed; between the target's echo and its shadow; not known; target's shadow.
@@ -160,7 +160,7 @@ def silhouette(
     """
     shadow = shadow_patches(dark_pixels(view, sigma_r, sigma_s), view.info.camera, target_m, reach_m)
     echo = echo_pixels(view, sigma_r, echo_db)
-    covered = covered_pixels(shadow, echo)
+    covered = covered_pixels(shadow, echo, view.info, target_m, reach_m)
     rows, cols = view.info.camera.shape
     mask = np.empty((rows, cols), np.uint8)
     for v in range(rows):
@@ -302,22 +302,39 @@ def echo_pixels(view: View, sigma_r: float, echo_db: float) -> NDArray[np.bool_]
     return echo
 
 
-def covered_pixels(shadow: NDArray[np.bool_], echo: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def covered_pixels(
+    shadow: NDArray[np.bool_],
+    echo: NDArray[np.bool_],
+    info: ViewInfo,
+    target_m: tuple[float, float],
+    reach_m: float,
+) -> NDArray[np.bool_]:
     """Mark what lies between the target's echo and its shadow, column by column.
 
-    It reaches from the farthest echo up-range to the shadow, by no more than the shadow's length in that
-    column. An edge that glitters has gaps: echoes up to two columns beside count. The two pixels before the
-    shadow, its flank, are covered without any echo.
+    It reaches from the farthest echo within reach of the target to the shadow. A side along range, g long, is
+    smeared by g/2 tan(w/2) to either side by the aperture w: a stretch of shadow that lies no farther inside
+    than that is led up to by no more than g, or by its own length where that is more. An edge that glitters
+    has gaps: echoes up to two columns beside count. The two pixels before the shadow, its flank, are covered
+    without any echo.
 
     Parameters
     ----------
     shadow, echo : ndarray of bool, shape (rows, cols)
         Target's shadow; echoes.
+    info : ViewInfo
+        The view.
+    target_m : (float, float)
+        Ground position (x, y) of the target, metres.
+    reach_m : float
+        Reach, metres.
 
     Returns
     -------
     ndarray of bool, shape (rows, cols)
     """
+    row_m, col_m = info.camera.spacing_m
+    near_end = int(ground_pixel(target_m, info.camera)[1] - reach_m / row_m)
+    rows_a_column = 2 * col_m / (row_m * math.tan(info.aperture_rad / 2))
     rows, cols = shadow.shape
     covered = np.zeros((rows, cols), bool)
     for u in range(cols):
@@ -327,7 +344,16 @@ def covered_pixels(shadow: NDArray[np.bool_], echo: NDArray[np.bool_]) -> NDArra
             end = start
             while end < rows and shadow[end, u]:
                 end += 1
-            farthest = max(0, start - (end - start))
+            inside = 0
+            for v in range(start, end):
+                left = right = u
+                while left >= 0 and shadow[v, left]:
+                    left -= 1
+                while right < cols and shadow[v, right]:
+                    right += 1
+                inside = max(inside, min(u - left, right - u))
+            smeared = start - int(inside * rows_a_column)
+            farthest = max(0, min(start - (end - start), max(near_end, smeared)))
             begin = max(farthest, start - 2)
             for v in range(farthest, start):
                 if echo[v, max(0, u - 2) : u + 3].any():

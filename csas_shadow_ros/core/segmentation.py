@@ -116,14 +116,15 @@ def segment_shadow(
     shadow, (top, left) = _of_target(levels, view.info, target_m, reach_m)
     if shadow.size:
         # What is covered begins on the target, and is told by echoes two columns beside it.
-        begin = max(0, min(top - len(shadow), _near_end(view.info, target_m, reach_m)))
+        near_end = _near_end(view.info, target_m, reach_m)
+        begin = max(0, min(top - len(shadow), near_end))
         before = max(0, left - BESIDE)
         rows, cols = slice(begin, top + len(shadow)), slice(left, left + shadow.shape[1])
         shadow = np.pad(shadow, ((top - begin, 0), (0, 0)))
         covered = np.zeros_like(shadow)
         if p.echo_unknown:
             echoes = echo[rows, before : cols.stop + BESIDE]
-            _before_shadow(shadow, echoes, left - before, view.info, covered)
+            _before_shadow(shadow, echoes, left - before, view.info, near_end - begin, covered)
         _add_shadow(shadow, covered, mask[rows, cols])
     return replace(view, pixels=mask)
 
@@ -256,6 +257,7 @@ def _mark_before(
     edge: NDArray[np.bool_],
     inside: NDArray[np.int32],
     rows_a_column: float,
+    near_end: int,
     flank: int,
     out: NDArray[np.bool_],
 ) -> None:  # pragma: no cover
@@ -273,7 +275,8 @@ def _mark_before(
                 continue
             if start < 0:
                 continue
-            reach = max(0, start - max(i - start, int(depth[j] * rows_a_column)))
+            far = max(near_end, start - int(depth[j] * rows_a_column))
+            reach = max(0, min(start - (i - start), far))
             begin = max(0, start - flank)
             for k in range(reach, start):
                 if edge[k, j]:
@@ -304,6 +307,7 @@ def _before_shadow(
     echo: NDArray[np.bool_],
     beside: int,
     info: ViewInfo,
+    near_end: int,
     out: NDArray[np.bool_],
 ) -> None:
     """Mark the pixels between the target's echo and its shadow: the target covers them.
@@ -318,7 +322,8 @@ def _before_shadow(
     and what is lit before it seabed beside the target. There g bounds what is left open, or the stretch's own
     length where that is more.
 
-    The echoes are those of as many rows, and of `beside` columns more on the left.
+    The echoes are those of as many rows, and of `beside` columns more on the left. No part of the target
+    stands up-range of row `near_end`.
     """
     # An edge that glitters has dark columns in it: its neighbours speak for them.
     edge = cv2.dilate(echo.astype(np.uint8), np.ones((1, 2 * BESIDE + 1), np.uint8)).view(bool)
@@ -327,7 +332,7 @@ def _before_shadow(
     row_m, col_m = info.camera.spacing_m
     rows_a_column = 2.0 * col_m / (row_m * max(math.tan(info.aperture_rad / 2.0), 1e-4))
     own = np.ascontiguousarray(edge[:, beside : beside + shadow.shape[1]])
-    _mark_before(np.ascontiguousarray(shadow), own, inside, rows_a_column, FLANK_PX, out)
+    _mark_before(np.ascontiguousarray(shadow), own, inside, rows_a_column, near_end, FLANK_PX, out)
 
 
 def silhouette_found(mask: View) -> bool:

@@ -94,6 +94,7 @@ def warm_likelihood() -> None:
 def warm_carving(parameters: CarvingParameters | None = None) -> None:
     """Carve a few voxels with a sample view by a method, and look at them as at the end of a run."""
     from .carving import Carver
+    from .explained import count_shadow_pixels
     from .hollows import matter_of
     from .measurement import levels_of_mask, silhouette_sides
     from .mesh import measure, mesh_from_grid
@@ -117,6 +118,10 @@ def warm_carving(parameters: CarvingParameters | None = None) -> None:
     occupied[:3, 4:8, 4:8] = True
     grid = replace(grid, occupied=occupied, likelihood=np.where(occupied, 0.0, 1.0).astype(np.float32))
     measure(mesh_from_grid(grid))
+    if p.method == "consensus":
+        carver.shadow_fits([grid])
+        voxels = np.ascontiguousarray(np.argwhere(occupied), np.int32)
+        count_shadow_pixels(view, grid.volume, voxels, pixels > 0, np.zeros(len(voxels), np.int32))
     for one in _both(shadow):
         made = _sample(shadow=one)
         matter_of(grid, [made.require("look")])

@@ -17,12 +17,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from ..core.errors import check_range
+from ..core.errors import ParameterError, check_range
 from ..core.geometry import GroundGrid
+from .occlusion import embree_tracer
 
 FloatArray = NDArray[np.float64]
 
@@ -200,8 +199,12 @@ class SeabedModel:
             corners = np.dstack([self._points, bed.height(x, y)])
             a, b, c, d = corners[:-1, :-1], corners[:-1, 1:], corners[1:, :-1], corners[1:, 1:]
             triangles = np.stack([np.stack([a, c, b], axis=2), np.stack([b, c, d], axis=2)], axis=2)
-            self._tracer = EmbreeScene()
-            TriangleMesh(self._tracer, triangles.reshape(-1, 3, 3).astype(np.float32))
+            try:
+                self._occluded = embree_tracer(triangles.reshape(-1, 3, 3))
+            except ImportError as error:  # trying each of that many triangles would take hours
+                raise ParameterError(
+                    "a seabed with relief needs embreex, which is not installed; expected a flat one here"
+                ) from error
 
     def _lattice(self, rows: int, cols: int) -> tuple[FloatArray, FloatArray]:
         """Return x (1, cols) and y (rows, 1) of a lattice over the image, cell (0, 0) on pixel (0, 0)."""
@@ -280,8 +283,7 @@ class SeabedModel:
         cosine = (ray[..., 2] - slope_x * ray[..., 0] - slope_y * ray[..., 1]) / (distance * steep)
         flat = ray[..., 2] / distance
         amplitude = np.maximum(cosine, 0.0) * np.sqrt(steep) / flat
-        origins = np.stack([x, y, z + _RAY_LIFT_M], axis=-1).reshape(-1, 3).astype(np.float32)
-        away = (ray / distance[..., None]).reshape(-1, 3).astype(np.float32)
-        hit = self._tracer.run(origins, np.ascontiguousarray(away), query="OCCLUDED")
-        amplitude *= (np.asarray(hit) < 0).reshape(x.shape)
+        origins = np.stack([x, y, z + _RAY_LIFT_M], axis=-1).reshape(-1, 3)
+        away = (ray / distance[..., None]).reshape(-1, 3)
+        amplitude *= ~self._occluded(origins, away).reshape(x.shape)
         return np.asarray(amplitude, np.float32)
