@@ -377,7 +377,10 @@ class Flow:
             return f"{', '.join(others)} to take the target"
         if self._gone and not self.sinks():
             return f"{', '.join(sorted(n for n, _ in self._gone))} to come back"
-        if now - self._born_s < self.sink_wait_s and len(self.sinks()) < self.min_sinks:
+        # So many are waited for once: whoever says goodbye after the first view is waited for no more, and who
+        # vanishes is in `_gone`.
+        begun = self._serial > 0
+        if not begun and now - self._born_s < self.sink_wait_s and len(self.sinks()) < self.min_sinks:
             return f"{self.min_sinks} sinks ({len(self.sinks())} are there)"
         if not self._leaves and not self._subscribers and now - self._served_s < self.sink_wait_s:
             return "a consumer"

@@ -399,6 +399,24 @@ def test_a_source_listens_no_longer_once_all_are_there_that_it_waits_for(missing
     assert bool(take_all(flow)) == (not missing)
 
 
+def test_a_sink_that_says_goodbye_in_mid_run_is_not_waited_for_though_it_was_counted_on() -> None:
+    flow, clock = make_flow(6, min_sinks=2, sink_wait_s=86400.0)
+    flow.look(subscribers=2)
+    carver, classifier = (
+        Consumer(flow, "carver", stream="shadow_mask"),
+        Consumer(flow, "classifier", stream="shadow"),
+    )
+    wait(flow, clock, 1.1, carver, classifier)
+    sent = take_all(flow)
+    assert sent
+    for stamp in sent:
+        carver.report(stamp)
+        classifier.report(stamp)
+    classifier.beat(leaving="true")
+    wait(flow, clock, 1.1, carver)
+    assert take_all(flow)
+
+
 def test_a_source_that_computed_meanwhile_reads_what_it_was_told_and_waits_no_longer() -> None:
     flow, clock = make_flow(6, settle_s=1.0)
     flow.look(subscribers=0)
