@@ -377,8 +377,8 @@ class Flow:
             return f"{', '.join(others)} to take the target"
         if self._gone and not self.sinks():
             return f"{', '.join(sorted(n for n, _ in self._gone))} to come back"
-        # So many are waited for once: whoever says goodbye after the first view is waited for no more, and who
-        # vanishes is in `_gone`.
+        # So many are waited for once: whoever says goodbye after the first view is waited for no more, and
+        # who vanishes is in `_gone`.
         begun = self._serial > 0
         if not begun and now - self._born_s < self.sink_wait_s and len(self.sinks()) < self.min_sinks:
             return f"{self.min_sinks} sinks ({len(self.sinks())} are there)"
