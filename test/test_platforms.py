@@ -140,7 +140,7 @@ def test_embree_is_asked_for_where_it_has_a_wheel() -> None:
     assert not asked("aarch64")
 
 
-@pytest.mark.parametrize("python", (PYTHONS[0], PYTHONS[-1]))  # half a minute each
+@pytest.mark.parametrize("python", [PYTHONS[0], PYTHONS[-1]])  # half a minute each
 def test_every_core_dependency_has_a_wheel_for_arm64(python: str, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--quiet"]
     command += ["--disable-pip-version-check", "--only-binary=:all:", "--target", str(tmp_path)]
