@@ -85,7 +85,7 @@ def reconstruct(
     >>> result = csas.reconstruct(run, csas.parameters(step_deg=15))
     >>> result
     Result: object, quality limited
-      the shadow leaves the image in ... of 24 views; expected a larger image
+      the shadow leaves the image in ... of 24 views, expected a larger image
       0... × 0... × 0... m, 0... m³, heading ...°, at x ..., y ... m
       24 views used, 0 refused, 288° of the circle
     >>> result.mesh.is_watertight

@@ -158,6 +158,12 @@ def test_a_result_that_does_not_explain_the_pictures_says_so(unexplained, lit, q
     assert explained_share(result) == pytest.approx(1.0 - unexplained)
 
 
+def test_no_reason_holds_what_separates_reasons():
+    result = Result(views_used=1, arc_rad=2.0 * math.pi, rejected={0.0: "dark; too dark"})
+    judge(result)
+    assert "1 of 2 views were not used: dark, too dark" in result.quality.reasons
+
+
 def test_nothing_is_said_of_a_fit_that_nobody_looked_at():
     result = Result(views_used=10, arc_rad=2.0 * math.pi, evidence=evidence(math.nan, math.nan))
     judge(result)

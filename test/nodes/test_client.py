@@ -289,7 +289,7 @@ def test_the_results_of_an_outside_stage_are_carved_and_the_graph_completes_thou
     graph.until(lambda: graph.measurements is not None and graph.measurements.final, "there is a result")
     assert graph.measurements.views_used == VIEWS
     assert len({*first.stamps(), *second.stamps()}) == VIEWS
-    assert len(graph.told("network")) == VIEWS
+    graph.until(lambda: len(graph.told("network")) == VIEWS, "every view is reported")
     assert set(graph.told("network").values()) == {"published"}
 
 

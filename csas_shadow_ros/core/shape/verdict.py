@@ -80,7 +80,9 @@ def judge(result: Result) -> None:
         if result.final and result.dimensions is not None and not result.dimensions.intervals:
             reasons.append("too few sides of shadows were seen for intervals")
             worst = max(worst, 1)
-    result.quality = Quality(("good", "limited", "not trustworthy")[worst], tuple(reasons))
+    # Semicolons separate reasons where they travel as one text: none may hold one.
+    told_reasons = tuple(reason.replace(";", ",") for reason in reasons)
+    result.quality = Quality(("good", "limited", "not trustworthy")[worst], told_reasons)
 
 
 def _candidates(result: Result) -> list[str]:
