@@ -30,7 +30,7 @@ SOURCES := $(shell find csas_shadow_ros msg_adapters config launch -type f \
 	-not -name '*.pyc' -not -path '*/__pycache__*' 2>/dev/null)
 PACKAGING := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help venv install demo test lint types unit accuracy accuracy-short population bench build clean
+.PHONY: help venv install demo test lint types unit long accuracy accuracy-short population bench build clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -71,6 +71,10 @@ unit: install ## pytest alone
 	@mkdir -p $(ROS_LOG_DIR)
 	$(PY) -m pytest -n $(PYTEST_WORKERS) --ignore=test/nodes
 	$(PY) -m pytest test/nodes  # whole graphs of processes: alone on the machine
+
+long: install ## the tests that `make test` leaves out: more of the same
+	@mkdir -p $(ROS_LOG_DIR)
+	$(PY) -m pytest -m long
 
 accuracy-short: install ## a few cases of it against their floors, in a minute
 	$(PY) benchmarks/accuracy.py --short

@@ -161,7 +161,15 @@ def assert_own(listener: Listener, one: SimulatedRun, expected: Result) -> None:
 
 
 @pytest.mark.parametrize("kind", ["image", "sectors"])
-@pytest.mark.parametrize("killed", [None, "voxel_carver", "shadow_likelihood", "composites"])
+@pytest.mark.parametrize(
+    "killed",
+    [
+        None,
+        "voxel_carver",
+        pytest.param("shadow_likelihood", marks=pytest.mark.long),
+        pytest.param("composites", marks=pytest.mark.long),
+    ],
+)
 def test_three_circles_over_three_contacts_leave_three_results_each_its_own(
     graph: Graph, contacts: list[SimulatedRun], alone: list[Result], kind: str, killed: str | None
 ) -> None:

@@ -201,7 +201,15 @@ def test_what_a_recording_lacks_is_named(run_bag: Path, tmp_path: Path) -> None:
     assert "there is no bag at" in lacking(tmp_path / "nowhere")[0]
 
 
-@pytest.mark.parametrize("victim", ["voxel_carver", "composites", "sub_aperture", "bag_recorder"])
+@pytest.mark.parametrize(
+    "victim",
+    [
+        "voxel_carver",
+        "composites",
+        pytest.param("sub_aperture", marks=pytest.mark.long),
+        pytest.param("bag_recorder", marks=pytest.mark.long),
+    ],
+)
 def test_a_node_killed_between_the_last_view_and_the_collection_of_the_result_costs_nothing(
     run_bag: Path,
     reference: Reference,
