@@ -68,7 +68,7 @@ class Told:
         return np.load(self.folder / "grid.npz")[name]
 
 
-@pytest.fixture(scope="module", params=list(SCENES))
+@pytest.fixture(scope="module", params=["box", "two bodies", pytest.param("frame", marks=pytest.mark.long)])
 def told(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Told]:
     """One scene, told in five ways."""
     profile, target, seed = SCENES[request.param]

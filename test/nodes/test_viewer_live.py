@@ -23,7 +23,7 @@ pytest.importorskip("aiohttp")
 from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M
 
 from csas_shadow_ros.core.pipeline import ProcessedView, Result
-from csas_shadow_ros.graph import Graph, graph_environment
+from csas_shadow_ros.graph import DomainReservation, Graph, graph_environment
 from csas_shadow_ros.replay import replay
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "viewer"))
@@ -148,9 +148,13 @@ def test_a_page_fills_from_the_live_graph_and_outlives_the_viewer_and_the_graph(
 def test_a_viewer_that_hangs_changes_neither_the_run_nor_its_grid(
     viewer: Viewer, run_bag: Path, tmp_path: Path, reference: tuple[Result, list[ProcessedView]]
 ) -> None:
+    # A replay reserves the domain that it is given: it must not be the test's own reservation.
+    reservation = DomainReservation()
+    viewer.domain = reservation.domain_id
     viewer.start()
     assert viewer.process is not None
     os.kill(viewer.process.pid, signal.SIGSTOP)
+    reservation.close()
     try:
         replayed = replay(run_bag, None, PARAMETERS, domain_id=viewer.domain, progress=False)
     finally:
