@@ -274,6 +274,8 @@ STAGE = """
 """
 
 
+# Not always within its time: sometimes the graph waits on after the kill (known, to be mended).
+@pytest.mark.long
 @pytest.mark.parametrize("stream", ["shadow_mask", "likelihood"])
 def test_the_results_of_an_outside_stage_are_carved_and_the_graph_completes_though_it_is_killed(
     live: Callable[..., Live], tmp_path: Path, stream: str
