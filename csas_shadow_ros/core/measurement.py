@@ -81,7 +81,7 @@ _FOREIGN_CELLS = 3.0
 _MIN_EDGES = 24
 #: Sides that scatter about the fitted plan by more than this (cross-range cells, 1σ) are not those of one
 #: plan: edges are found to a fraction of a cell. Simulated targets scatter by 0.19 to 0.57, the chips of a
-#: measured vehicle, which were cut out one by one (docs/examples.md), by 1.8.
+#: measured vehicle, which were cut out one by one (docs/examples.md), by 1.7.
 _ONE_PLAN_CELLS = 1.0
 #: Resamplings of the views.
 _RESAMPLINGS = 20
