@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from .echo import count_looks, layover_per_metre
 from .geometry import ViewInfo
 from .likelihood import Levels, box_mean
+from .local_means import ECHO_CELLS
 from .mesh import mesh_from_grid
 from .volume import Volume, VoxelGrid
 
@@ -37,10 +38,11 @@ if TYPE_CHECKING:
 
 BoolArray = NDArray[np.bool_]
 
-#: Dark: the 3×3 mean power is under this part of the seabed's. Empty space behind a rim is in shadow.
+#: Dark: the mean power over a box of a cell (`ECHO_CELLS`) is under this part of the seabed's. Empty space
+#: behind a rim is in shadow.
 _DARK_POWER = 0.5
 #: A visible voxel is empty where at least this share of the views that see it are dark there. Rough matter is
-#: dark in a quarter of its looks by speckle (3×3 pixels are about two looks), empty space in nearly all.
+#: dark in a quarter of its looks by speckle (such a box is about two looks), empty space in nearly all.
 #: At 0.45 speckle opens a solid cylinder by some voxels.
 _DARK_SHARE = 0.5
 #: At least this share of all views must see a voxel: neighbouring views share their aperture and its speckle.
@@ -55,8 +57,8 @@ _PIT_NEIGHBOURS = 5
 _WALL_DARK = 2.0 / 3.0
 #: Smaller hollows bare too little wall to be judged by it (voxels: 3 a side).
 _LEAST_HOLLOW = 27
-#: Pixels kept round what a view shows of the volume: the 3×3 mean, and rounding.
-_MARGIN_PX = 3
+#: Pixels kept round what a view shows of the volume, beside the box of the mean: rounding.
+_ROUNDING_PX = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,11 +95,12 @@ class EchoLook:
         volume : Volume
             What is carved.
         """
-        rows, cols = _pixels_of(info, volume)
+        box = levels.local.box_px(ECHO_CELLS)
+        rows, cols = _pixels_of(info, volume, box)
         known = levels.known[rows, cols]
         # Where the contrast is poor, shadow itself may be brighter: dark is then halfway between both in dB.
         limit = np.float32(max(_DARK_POWER, 1.0 / levels.contrast))
-        dark = known & (box_mean(levels.power[rows, cols], known, (1, 1)) < limit) if known.size else known
+        dark = known & (box_mean(levels.power[rows, cols], known, box) < limit) if known.size else known
         packed = zlib.compress(np.packbits(np.stack([dark, known])).tobytes(), 1)
         return cls(info, (rows.start, cols.start), (known.shape[0], known.shape[1]), packed)
 
@@ -109,7 +112,7 @@ class EchoLook:
         return dark, known
 
 
-def _pixels_of(info: ViewInfo, volume: Volume) -> tuple[slice, slice]:
+def _pixels_of(info: ViewInfo, volume: Volume, box: tuple[int, int]) -> tuple[slice, slice]:
     """Return the rows and columns of a view that a volume's echoes can lie in."""
     x, y, _ = volume.centre_m
     length, width, height = volume.size_m
@@ -118,9 +121,11 @@ def _pixels_of(info: ViewInfo, volume: Volume) -> tuple[slice, slice]:
     camera = info.camera
     pixels = corners @ camera.ground_to_pixel[:2, :2].T + camera.ground_to_pixel[:2, 2]
     slices = []
-    for low, high, n in zip(pixels.min(axis=0), pixels.max(axis=0), camera.shape[::-1], strict=True):
-        first = min(max(0, math.floor(low) - _MARGIN_PX), n)
-        slices.append(slice(first, min(max(first, math.ceil(high) + _MARGIN_PX + 1), n)))
+    bounds = zip(pixels.min(axis=0), pixels.max(axis=0), camera.shape[::-1], box[::-1], strict=True)
+    for low, high, n, half in bounds:
+        margin = half + _ROUNDING_PX
+        first = min(max(0, math.floor(low) - margin), n)
+        slices.append(slice(first, min(max(first, math.ceil(high) + margin + 1), n)))
     return slices[1], slices[0]
 
 

@@ -28,8 +28,8 @@ _MEDIAN_OVER_MODE = math.sqrt(2.0 * math.log(2.0))
 _LATTICE = 33
 #: A view needs this many known pixels for its seabed level to be estimated.
 _MIN_PIXELS = 256
-#: Shadow interiors of fewer pixels than this do not give a level.
-_MIN_SHADOW_PIXELS = 40
+#: Shadow interiors of fewer resolution cells than this do not give a level.
+_LEAST_CELLS = 9.0
 #: A shadow less than 4 dB under the seabed is its own speckle.
 _MIN_CONTRAST2 = 10.0**0.4
 
@@ -394,15 +394,15 @@ def fit_contrast(local: LocalMeans, start_db: float) -> tuple[float, float] | No
         None where the view holds no shadow to measure: the fit is then refused rather than trusted.
     """
     contrast2 = 10.0 ** (start_db / 10.0)
-    # A pixel is inside a shadow if all of its 5×5 neighbours are dark: if the brightest of them is.
-    # Halfway between the two levels in dB; patches of 5×5 looks seldom cross it by chance. No threshold
+    # A pixel is inside a shadow if all of its neighbours are dark: if the brightest of them is.
+    # Halfway between the two levels in dB; boxes of so many looks seldom cross it by chance. No threshold
     # that is asked for below lies higher than that of the least contrast.
     levels, powers = local.interiors(float(np.float32(min(contrast2, _MIN_CONTRAST2) ** -0.5)))
     count = 0
     for _ in range(3):
         interior = powers[levels < contrast2**-0.5]
         count = interior.size
-        if count < _MIN_SHADOW_PIXELS:
+        if count < local.pixels(_LEAST_CELLS):
             return None
         contrast2 = 1.0 / max(float(interior.mean(dtype=np.float64)), 1e-6)
         if contrast2 < _MIN_CONTRAST2:
@@ -434,14 +434,14 @@ def view_levels(view: View, parameters: LikelihoodParameters | None = None) -> L
     spans = np.empty((amplitude.shape[0], 2), np.int32)
     seabed = np.empty(tuple(-(-n // 8) for n in amplitude.shape), np.float32)
     _relative_power(amplitude, seabed_level(amplitude, p.background), power, known, spans, seabed)
-    local = LocalMeans(power, known, spans)
+    local = LocalMeans(power, known, view.info.cell_px, spans)
     fit = fit_contrast(local, p.shadow_contrast_db) if p.shadow_level == "estimated" else None
     contrast, fraction = fit or (10.0 ** (p.shadow_contrast_db / 20.0), math.nan)
     return Levels(_median(seabed), contrast, fraction, fit is not None, local)
 
 
 def echo_mask(local: LocalMeans, echo_db: float) -> NDArray[np.bool_]:
-    """Mark echoes: pixels whose 3×3 mean power is `echo_db` above the seabed's.
+    """Mark echoes: pixels whose mean power over a box of a cell is `echo_db` above the seabed's.
 
     Parameters
     ----------
@@ -450,7 +450,6 @@ def echo_mask(local: LocalMeans, echo_db: float) -> NDArray[np.bool_]:
     echo_db : float
         Threshold over the seabed's mean power 2σ_r², dB.
     """
-    # With a pixel more around: the flank of an echo's response is neither seabed nor shadow.
     return local.echoes(10.0 ** (echo_db / 10.0))
 
 

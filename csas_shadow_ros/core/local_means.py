@@ -7,6 +7,8 @@ Half of a view is off the image: every row is looked at only where it knows some
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,8 +25,11 @@ MOST_POWER = 1e7
 _CHUNK = 32
 #: The whole of an axis.
 _ALL = slice(None)
-#: Shadow is measured where everything this far around is dark: by boxes of 5×5, the brightest of 5×5.
-_INNER = 2
+#: Half-sizes of boxes (resolution cells: down-range, across). An echo is told by the mean of one, and marked
+#: as far beyond: the flank of its response is neither seabed nor shadow.
+ECHO_CELLS = (0.6, 0.375)
+#: Shadow is measured where everything as far around is dark: by boxes of this size, the brightest of as many.
+INNER_CELLS = (1.2, 0.75)
 
 # Columns are counted unsigned in the loops over pixels: the compiler then need not ask whether an index
 # counts from the end, and makes vectors of them without a slice for each row, which costs as much as 50
@@ -137,46 +142,61 @@ def _any_over(
 
 @kernel()
 def _mark_echoes(
-    power: FloatImage, known: BoolImage, spans: Spans, threshold: float, out: BoolImage
+    power: FloatImage,
+    known: BoolImage,
+    spans: Spans,
+    radius: tuple[int, int],
+    threshold: float,
+    out: BoolImage,
 ) -> None:  # pragma: no cover
-    """Mark the known pixels whose 3×3 mean is over a threshold, and their neighbours."""
+    """Mark the known pixels whose box's mean is over a threshold, and all in the box around them."""
     rows, cols = power.shape
+    r, c = radius
+    turn = 2 * r + 1
     # No mean is over the threshold without a pixel in its box that is: chunks that lie near none are passed
-    # over. `bright` says of each row of chunks whether it, or the column beside it, holds one.
+    # over. `bright` says of each row of chunks whether it, or a column beside it in the box, holds one.
     least = np.float32(threshold)
-    bright = np.zeros((3, cols // _CHUNK + 1), np.bool_)
-    over, total = np.zeros(_CHUNK + 2), np.empty(_CHUNK)
-    for w in range(rows + 1):
+    chunks = cols // _CHUNK + 1
+    bright = np.zeros((turn, chunks), np.bool_)
+    over, total = np.zeros(_CHUNK + 2 * c), np.empty(_CHUNK)
+    for w in range(rows + r):
         if w < rows:
             first, last = spans[w]
-            bright[w % 3, :] = False
-            for chunk in range(max(0, first - 1) // _CHUNK, (last + _CHUNK) // _CHUNK):
-                left, right = max(first, chunk * _CHUNK - 1), min(last, (chunk + 1) * _CHUNK + 1)
-                bright[w % 3, chunk] = _any_over(power, w, left, max(left, right), least)
-        v = w - 1
+            bright[w % turn, :] = False
+            for chunk in range(max(0, first - c) // _CHUNK, min(chunks, (last + c - 1) // _CHUNK + 1)):
+                left, right = max(first, chunk * _CHUNK - c), min(last, (chunk + 1) * _CHUNK + c)
+                bright[w % turn, chunk] = _any_over(power, w, left, max(left, right), least)
+        v = w - r
         if v < 0:
             continue
-        top, bottom = max(0, v - 1), min(rows, v + 2)
+        top, bottom = max(0, v - r), min(rows, v + r + 1)
         first, last = spans[v]
         for chunk in range(first // _CHUNK, (last + _CHUNK - 1) // _CHUNK):
-            if not (bright[top % 3, chunk] | bright[v % 3, chunk] | bright[(bottom - 1) % 3, chunk]):
+            some = False
+            for b in range(top, bottom):
+                some |= bright[b % turn, chunk]
+            if not some:
                 continue
             begin, end = chunk * _CHUNK, min(cols, (chunk + 1) * _CHUNK)
-            left, right = max(0, begin - 1), min(cols, end + 1)
+            left, right = max(0, begin - c), min(cols, end + c)
             over[:] = 0.0
-            shift = 1 - begin
+            shift = c - begin
             for b in range(top, bottom):
                 for u in range(_index(left), _index(right)):
                     bounded = min(np.float64(power[b, u]), MOST_POWER)
                     over[u + _index(shift)] += bounded - threshold * known[b, u]
+            total[:] = over[:_CHUNK]
+            for s in range(1, 2 * c + 1):
+                beside = over[s : s + _CHUNK]
+                for i in range(_CHUNK):
+                    total[i] += beside[i]
             some = False
             for i in range(_CHUNK):
-                total[i] = over[i] + over[i + 1] + over[i + 2]
                 some |= total[i] > 0.0
             if some:
                 for u in range(begin, end):
                     if known[v, u] and total[u - begin] > 0.0:
-                        out[top:bottom, max(0, u - 1) : u + 2] = True
+                        out[top:bottom, max(0, u - c) : u + c + 1] = True
 
 
 @kernel(error_model="numpy")
@@ -184,63 +204,79 @@ def _interiors(
     power: FloatImage,
     known: BoolImage,
     spans: Spans,
+    radius: tuple[int, int],
     threshold: float,
     levels: FloatImage,
     powers: FloatImage,
 ) -> int:  # pragma: no cover
-    """List the pixels whose brightest neighbour in 5×5, by its own 5×5 mean, is under a threshold.
+    """List the pixels whose brightest neighbour in a box, by the mean of its own, is under a threshold.
 
     Returns their number; `levels` gets the mean of that neighbour, `powers` the pixel's own power.
     """
     rows, cols = power.shape
-    turn = 2 * _INNER + 1
+    r, c = radius
+    turn = 2 * r + 1
     infinite = np.float32(np.inf)
-    # With two columns more to either side of the view, which add nothing to a sum nor raise a maximum.
-    sums, counts = np.zeros(cols + 2 * _INNER), np.zeros(cols + 2 * _INNER, np.float32)
-    means = np.empty(cols + 2 * _INNER, np.float32)
+    # With `c` columns more to either side of the view, which add nothing to a sum nor raise a maximum.
+    sums, counts = np.zeros(cols + 2 * c), np.zeros(cols + 2 * c, np.float32)
+    means = np.empty(cols + 2 * c, np.float32)
+    totals, numbers = np.empty(cols), np.empty(cols, np.float32)
     brightest = np.full((turn, cols), -infinite)
     highest = np.empty(cols, np.float32)
     found = 0
-    for w in range(-_INNER, rows + _INNER):
-        come, gone = w + _INNER, w - _INNER - 1
+    for w in range(-r, rows + r):
+        come, gone = w + r, w - r - 1
         if come < rows:
             for u in range(_index(spans[come, 0]), _index(spans[come, 1])):
-                sums[u + _index(_INNER)] += min(np.float64(power[come, u]), MOST_POWER)
-                counts[u + _index(_INNER)] += np.float32(known[come, u])
+                sums[u + _index(c)] += min(np.float64(power[come, u]), MOST_POWER)
+                counts[u + _index(c)] += np.float32(known[come, u])
         if 0 <= gone < rows:
             for u in range(_index(spans[gone, 0]), _index(spans[gone, 1])):
-                sums[u + _index(_INNER)] -= min(np.float64(power[gone, u]), MOST_POWER)
-                counts[u + _index(_INNER)] -= np.float32(known[gone, u])
+                sums[u + _index(c)] -= min(np.float64(power[gone, u]), MOST_POWER)
+                counts[u + _index(c)] -= np.float32(known[gone, u])
         if w >= rows:
             brightest[w % turn, :] = -infinite
         elif w >= 0:
             first, last = spans[w]
-            s, n = sums[first : last + 2 * _INNER], counts[first : last + 2 * _INNER]
-            mean, here = means[first + _INNER : last + _INNER], known[w, first:last]
-            for i in range(last - first):
-                total = s[i] + s[i + 1] + s[i + 2] + s[i + 3] + s[i + 4]
-                count = n[i] + n[i + 1] + n[i + 2] + n[i + 3] + n[i + 4]
-                mean[i] = np.float32(total) / count if here[i] else infinite
-            for u in range(first - _INNER, first):
-                means[u + _INNER] = infinite if u >= 0 else -infinite
-            for u in range(last, last + _INNER):
-                means[u + _INNER] = infinite if u < cols else -infinite
-            m, most = means[first : last + 2 * _INNER], brightest[w % turn, first:last]
-            for i in range(last - first):
-                most[i] = max(max(max(m[i], m[i + 1]), max(m[i + 2], m[i + 3])), m[i + 4])
-        v = w - _INNER
+            length = last - first
+            total, number = totals[:length], numbers[:length]
+            total[:], number[:] = sums[first:last], counts[first:last]
+            for s in range(1, 2 * c + 1):
+                sums_beside, counts_beside = sums[first + s : last + s], counts[first + s : last + s]
+                for i in range(length):
+                    total[i] += sums_beside[i]
+                    number[i] += counts_beside[i]
+            mean, here = means[first + c : last + c], known[w, first:last]
+            for i in range(length):
+                mean[i] = np.float32(total[i]) / number[i] if here[i] else infinite
+            for u in range(first - c, first):
+                means[u + c] = infinite if u >= 0 else -infinite
+            for u in range(last, last + c):
+                means[u + c] = infinite if u < cols else -infinite
+            most = brightest[w % turn, first:last]
+            most[:] = means[first:last]
+            for s in range(1, 2 * c + 1):
+                means_beside = means[first + s : last + s]
+                for i in range(length):
+                    most[i] = max(most[i], means_beside[i])
+        v = w - r
         if v < 0:
             continue
         # Beyond the span of any of these rows a neighbour is unknown.
-        begin, end = max(0, v - _INNER), min(rows, v + _INNER + 1)
+        begin, end = max(0, v - r), min(rows, v + r + 1)
         first, last = 0, cols
         for b in range(begin, end):
             first, last = max(first, spans[b, 0]), min(last, spans[b, 1])
         some = False
-        for u in range(_index(first), _index(max(first, last))):
-            a, b = max(brightest[0, u], brightest[1, u]), max(brightest[2, u], brightest[3, u])
-            highest[u] = max(max(a, b), brightest[4, u])
-            some |= highest[u] < threshold
+        last = max(first, last)
+        above = highest[first:last]
+        above[:] = brightest[0, first:last]
+        for b in range(1, turn):
+            row = brightest[b, first:last]
+            for i in range(last - first):
+                above[i] = max(above[i], row[i])
+        for i in range(last - first):
+            some |= above[i] < threshold
         if not some:
             continue
         for u in range(first, last):
@@ -253,7 +289,7 @@ def _interiors(
 class LocalMeans:
     """Means of a view's power over boxes of its known pixels.
 
-    Boxes are given by their half-size (rows, cols) in pixels, and end at the view's edges.
+    Boxes are given by their half-size (rows, cols) in resolution cells, and end at the view's edges.
 
     Parameters
     ----------
@@ -261,14 +297,23 @@ class LocalMeans:
         (i/σ_r)²/2; 0 where unknown.
     known : ndarray of bool, shape (rows, cols)
         Pixels to count.
+    cell_px : (float, float)
+        Pixels a resolution cell, (rows, cols): `ViewInfo.cell_px`.
     spans : ndarray of int32, shape (rows, 2), optional
         Columns outside of which each row knows nothing: first, and one after the last. Looked for if not
         given.
     """
 
-    def __init__(self, power: FloatImage, known: BoolImage, spans: Spans | None = None) -> None:
+    def __init__(
+        self,
+        power: FloatImage,
+        known: BoolImage,
+        cell_px: tuple[float, float],
+        spans: Spans | None = None,
+    ) -> None:
         self.power = power
         self.known = known
+        self.cell_px = cell_px
         self.spans = _spans_of(known) if spans is None else spans
 
     @property
@@ -276,15 +321,27 @@ class LocalMeans:
         """Number of known pixels."""
         return int(np.count_nonzero(self.known))
 
+    def box_px(self, half_cells: tuple[float, float]) -> tuple[int, int]:
+        """Return the half-size of a box in pixels, at least one each way and at most the view's."""
+        rows, cols = (
+            round(min(half * cell, n))
+            for half, cell, n in zip(half_cells, self.cell_px, self.known.shape, strict=True)
+        )
+        return max(rows, 1), max(cols, 1)
+
+    def pixels(self, cells: float) -> int:
+        """Return how many pixels so many resolution cells have."""
+        return math.ceil(cells * self.cell_px[0] * self.cell_px[1])
+
     def under(
-        self, radius_px: tuple[int, int], threshold: float, rows: slice = _ALL, cols: slice = _ALL
+        self, half_cells: tuple[float, float], threshold: float, rows: slice = _ALL, cols: slice = _ALL
     ) -> BoolImage:
         """Mark the known pixels around which the mean is less than a threshold, in a part of the view.
 
         Parameters
         ----------
-        radius_px : (int, int)
-            Half-size of the box.
+        half_cells : (float, float)
+            Half-size of the box, resolution cells.
         threshold : float
             Mean power.
         rows, cols : slice
@@ -292,17 +349,17 @@ class LocalMeans:
         """
         out = np.empty(self.known[rows, cols].shape, np.bool_)
         corner = rows.indices(self.known.shape[0])[0], cols.indices(self.known.shape[1])[0]
-        _under(self.power, self.known, self.spans, corner, radius_px, threshold, out)
+        _under(self.power, self.known, self.spans, corner, self.box_px(half_cells), threshold, out)
         return out
 
     def echoes(self, threshold: float) -> BoolImage:
-        """Mark the known pixels whose mean of 3×3 is more than a threshold, and their neighbours."""
+        """Mark the known pixels whose mean over `ECHO_CELLS` is over a threshold, and all in that box."""
         out = np.zeros(self.known.shape, np.bool_)
-        _mark_echoes(self.power, self.known, self.spans, threshold, out)
+        _mark_echoes(self.power, self.known, self.spans, self.box_px(ECHO_CELLS), threshold, out)
         return out
 
     def interiors(self, threshold: float) -> tuple[FloatImage, FloatImage]:
-        """List the pixels all of whose 5×5 neighbours have means of 5×5 under a threshold.
+        """List the pixels all of whose neighbours in `INNER_CELLS` have means over as much under a threshold.
 
         Returns
         -------
@@ -310,5 +367,6 @@ class LocalMeans:
             The highest of these means, and the pixel's own power, row by row.
         """
         levels, powers = (np.empty(self.known.size, np.float32) for _ in range(2))
-        found = _interiors(self.power, self.known, self.spans, threshold, levels, powers)
+        radius = self.box_px(INNER_CELLS)
+        found = _interiors(self.power, self.known, self.spans, radius, threshold, levels, powers)
         return levels[:found], powers[:found]

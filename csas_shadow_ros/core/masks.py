@@ -15,10 +15,20 @@ from .kernels import kernel
 #: Values of a shadow mask (mono8). Covered: lit, between an echo and the shadow behind it; either the
 #: target's own echo, laid over what it hides, or seabed that is seen under it.
 MASK_OUTSIDE, MASK_COVERED, MASK_UNKNOWN, MASK_SHADOW = 0, 64, 128, 255
-#: An echo speaks for as many columns on either side.
-BESIDE = 2
-#: The flank of a shadow without an echo before it (pixels).
-FLANK_PX = 2
+#: An echo speaks for so much on either side of it (resolution cells across): an edge that glitters has gaps.
+_BESIDE_CELLS = 0.75
+#: The flank of a shadow without an echo before it (resolution cells down-range).
+_FLANK_CELLS = 1.2
+
+
+def beside_px(info: ViewInfo) -> int:
+    """Return how many columns on either side an echo speaks for."""
+    return max(1, round(_BESIDE_CELLS * info.cell_px[1]))
+
+
+def flank_px(info: ViewInfo) -> int:
+    """Return how many rows before a shadow are its flank."""
+    return max(1, round(_FLANK_CELLS * info.cell_px[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +58,10 @@ class KeptMask:
         view = self.view()
         if not (view.pixels == MASK_COVERED).any():
             return self
-        return KeptMask.of(View(self.info, near_covered(view.pixels)))
+        return KeptMask.of(near_covered(view))
 
 
-def near_covered(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def near_covered(mask: View) -> View:
     """Take covered pixels that lie farther before a stretch of shadow than it is long for lit seabed.
 
     What stands that near may be an open frame, what lies farther a low wide body: the two readings of a mask
@@ -59,16 +69,18 @@ def near_covered(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
     Parameters
     ----------
-    mask : ndarray of uint8, shape (rows, cols)
-        A shadow mask.
+    mask : View
+        A shadow mask, shape (rows, cols).
     """
-    out = np.where(mask == MASK_COVERED, np.uint8(MASK_OUTSIDE), mask)
-    _mark_near(np.ascontiguousarray(mask), out)
-    return out
+    out = np.where(mask.pixels == MASK_COVERED, np.uint8(MASK_OUTSIDE), mask.pixels)
+    _mark_near(np.ascontiguousarray(mask.pixels), flank_px(mask.info), beside_px(mask.info), out)
+    return View(mask.info, out)
 
 
 @kernel()
-def _mark_near(mask: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:  # pragma: no cover
+def _mark_near(
+    mask: NDArray[np.uint8], flank: int, beside: int, out: NDArray[np.uint8]
+) -> None:  # pragma: no cover
     """Mark covered pixels from the farthest echo on that is no farther than the stretch behind it is long."""
     rows, cols = mask.shape
     starts = np.full(cols, -1, np.int32)
@@ -82,10 +94,10 @@ def _mark_near(mask: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:  # prag
                 starts[j] = i
                 continue
             reach = max(0, start - (i - start))
-            begin = max(reach, start - FLANK_PX)
+            begin = max(reach, start - flank)
             for k in range(reach, start):
                 echo = False
-                for c in range(max(0, j - BESIDE), min(cols, j + BESIDE + 1)):
+                for c in range(max(0, j - beside), min(cols, j + beside + 1)):
                     echo |= mask[k, c] == MASK_UNKNOWN
                 if echo:
                     begin = min(begin, k)

@@ -41,25 +41,28 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-#: Rows of a silhouette's side whose edge is so many pixels from the outermost take part.
-_SIDE_PX = 5.0
-_MEDIAN_ROWS = 9
-#: Columns on either side of the edge that its mean place is taken from.
-_HALF_PX = 6
-#: A side that is drawn in by less than this over its rows is straight along range (pixels).
-_TAPER_PX = 2.5
-#: A side whose middle stands out by more than this is round (pixels).
-_BULGE_PX = 0.8
+#: Rows of a silhouette's side whose edge is so far from the outermost take part, by a running median over so
+#: many rows to either side (resolution cells across, and down-range).
+_SIDE_CELLS, _MEDIAN_HALF_CELLS = 1.9, 2.4
+#: The edge's mean place is taken from so much on either side of it (resolution cells across).
+_PROFILE_CELLS = 2.25
+#: A side that is drawn in by less than this over its rows is straight along range (resolution cells across).
+_TAPER_CELLS = 0.94
+#: A side whose middle stands out by more than this is round (resolution cells across).
+_BULGE_CELLS = 0.3
 #: The side of what is round stands out most within this share of its rows; else it tapers.
 _BULGE_WITHIN = 0.8
-#: Fewer rows than this give no edge.
-_MIN_ROWS = 8
+#: An edge is told by at least so much of it (resolution cells down-range).
+_LEAST_CELLS = 4.8
+#: Roughness of an edge that no fit must explain (resolution cells across): a pixel's rounding.
+_ROUGH_CELLS = 0.11
 #: What a side of a silhouette may be: as far out at every range, drawn in upwards, out in its middle, or
 #: straight above a foot that stands out.
 SHAPES = ("straight", "tapering", "round", "flared")
 _STRAIGHT, _FLARED = SHAPES.index("straight"), SHAPES.index("flared")
-#: A foot is so many rows long, and stands out if the views beside agree on more than this (pixels).
-_FOOT_ROWS, _FLARE_PX = 24, 1.0
+#: A foot is so long (resolution cells down-range), and stands out if the views beside agree on more than this
+#: (across).
+_FOOT_CELLS, _FLARE_CELLS = 14.4, 0.375
 #: What all sides are counts so much of what the sides beside are.
 _ALL_SIDES = 1.0
 #: Directions that a plan's sides may face, and looks over an aperture.
@@ -171,7 +174,7 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
     e_c = cross_range_axis(info.aspect_rad)
     directions, supports, shapes = [], [], []
     for sign, edge in ((1, last), (-1, first)):
-        found = _side(levels, rows, sign * (edge - u0) * scale, scale, sign, (u0, v0))
+        found = _side(levels, rows, sign * (edge - u0) * scale, scale, sign, (u0, v0), info.cell_px)
         if found is None:
             continue
         out, shape = found
@@ -194,7 +197,9 @@ def levels_of_mask(mask: View) -> Levels:
     """Stand in for the levels of a view of which only the silhouette is there, such as one drawn by hand."""
     known = mask.pixels != MASK_UNKNOWN
     power = (known & (mask.pixels != MASK_SHADOW)).astype(np.float32)
-    return Levels(math.nan, _DRAWN_CONTRAST, math.nan, False, LocalMeans(power, np.asarray(known)))
+    return Levels(
+        math.nan, _DRAWN_CONTRAST, math.nan, False, LocalMeans(power, np.asarray(known), mask.info.cell_px)
+    )
 
 
 def _side(
@@ -204,6 +209,7 @@ def _side(
     scale: FloatArray,
     sign: int,
     target_px: tuple[float, float],
+    cell_px: tuple[float, float],
 ) -> tuple[dict[str, float], str] | None:
     """Return how far out a side reaches (pixels from column u0, at the target's range) if it is of each of
     `SHAPES`, and which it seems to be.
@@ -211,23 +217,25 @@ def _side(
     None where too little of it is seen.
     """
     # By a running median: choosing rows by their own edges would favour those that err outwards.
-    calm = scipy.ndimage.median_filter(out_px, _MEDIAN_ROWS, mode="nearest")
-    kept = np.abs(calm - np.percentile(calm, 90)) <= _SIDE_PX
-    if kept.sum() < _MIN_ROWS:
+    down_px, across_px = cell_px
+    calm = scipy.ndimage.median_filter(out_px, 2 * round(_MEDIAN_HALF_CELLS * down_px) + 1, mode="nearest")
+    kept = np.abs(calm - np.percentile(calm, 90)) <= _SIDE_CELLS * across_px
+    if kept.sum() < _LEAST_CELLS * down_px:
         return None
     rows, out_px, scale = rows[kept], out_px[kept], scale[kept]
     u0, v0 = target_px
-    curves, shape, slope = _fitted_side(rows - rows.mean(), out_px)
+    curves, shape, slope = _fitted_side(rows - rows.mean(), out_px, across_px)
     # The target's echo hides the foot of a side that is drawn in upwards: its shadow would begin at the
     # target's own range.
     hidden = min(max(0.0, float(rows[0]) - v0), float(rows[-1] - rows[0]))
     out = dict.fromkeys(SHAPES, math.nan)
     for name, curve in curves.items():
         foot = max(0.0, -slope) * hidden if name == "tapering" else 0.0
-        out[name] = float(curve.max()) + foot + _edge_beyond(levels, rows, scale, sign * curve, sign, u0)
-    near = rows < rows[0] + _FOOT_ROWS
+        beyond = _edge_beyond(levels, rows, scale, sign * curve, sign, u0, across_px)
+        out[name] = float(curve.max()) + foot + beyond
+    near = rows < rows[0] + _FOOT_CELLS * down_px
     foot_px = np.full(int(near.sum()), float(calm[kept][near].mean()))
-    beyond_foot = _edge_beyond(levels, rows[near], scale[near], sign * foot_px, sign, u0)
+    beyond_foot = _edge_beyond(levels, rows[near], scale[near], sign * foot_px, sign, u0, across_px)
     out["flared"] = float(foot_px[0]) + beyond_foot
     return None if math.isnan(out[shape]) else (out, shape)
 
@@ -239,12 +247,14 @@ def _edge_beyond(
     curve: FloatArray,
     sign: int,
     u0: float,
+    cell_px: float,
 ) -> float:
     """Return how far outside of a fitted side (columns from u0, at the target's range) its edge lies, pixels.
 
     From the mean profile across the edge, rows laid over one another along the side; NaN where unknown.
     """
-    steps = sign * np.arange(-_HALF_PX, _HALF_PX + 1)
+    half = max(1, round(_PROFILE_CELLS * cell_px))
+    steps = sign * np.arange(-half, half + 1)
     columns = np.round(u0 + (curve[:, None] + steps) / scale[:, None]).astype(np.intp)
     inside = (columns >= 0) & (columns < levels.power.shape[1])
     offsets = sign * ((columns - u0) * scale[:, None] - curve[:, None])
@@ -255,10 +265,12 @@ def _edge_beyond(
     power = np.where(known, levels.power[rows[:, None], columns], 0.0).sum(axis=0) / known.sum(axis=0)
     shadow_power = 1.0 / levels.contrast**2
     dark = np.clip((1.0 - power) / (1.0 - shadow_power), -0.5, 1.2)
-    return -_HALF_PX - 0.5 + float(dark.sum()) + float((offsets - sign * steps).mean())
+    return -half - 0.5 + float(dark.sum()) + float((offsets - sign * steps).mean())
 
 
-def _fitted_side(along: FloatArray, out_px: FloatArray) -> tuple[dict[str, FloatArray], str, float]:
+def _fitted_side(
+    along: FloatArray, out_px: FloatArray, cell_px: float
+) -> tuple[dict[str, FloatArray], str, float]:
     """Fit a side with each of `SHAPES` that it may have; say which it seems to be, and its taper."""
     weight = np.ones_like(out_px)
     slope = level = 0.0
@@ -268,16 +280,17 @@ def _fitted_side(along: FloatArray, out_px: FloatArray) -> tuple[dict[str, Float
         slope = float((weight * (along - middle) * (out_px - level)).sum()) / max(spread, 1e-9)
         level -= slope * float(middle)
         residual = np.abs(out_px - level - slope * along)
-        weight = 1.0 / np.maximum(1.0, residual / (1.5 * (1.4826 * float(np.median(residual)) + 0.3)))
+        rough = 1.4826 * float(np.median(residual)) + _ROUGH_CELLS * cell_px
+        weight = 1.0 / np.maximum(1.0, residual / (1.5 * rough))
     mean = float(np.average(out_px, weights=weight))
     reach = max(float(np.abs(along).max()), 1.0)
     design = np.stack([np.ones_like(along), along / reach, (along / reach) ** 2], axis=1)
     bend, *_ = np.linalg.lstsq(design * weight[:, None], out_px * weight, rcond=None)
     curves = {"straight": np.full_like(out_px, mean), "tapering": np.asarray(level + slope * along)}
-    shape = "tapering" if abs(slope) * float(np.ptp(along)) >= _TAPER_PX else "straight"
+    shape = "tapering" if abs(slope) * float(np.ptp(along)) >= _TAPER_CELLS * cell_px else "straight"
     if bend[2] < 0.0 and abs(bend[1] / (2.0 * bend[2])) < _BULGE_WITHIN:
         curves["round"] = np.asarray(design @ bend)
-        if float(curves["round"].max()) - mean > _BULGE_PX:
+        if float(curves["round"].max()) - mean > _BULGE_CELLS * cell_px:
             shape = "round"
     return curves, shape, slope
 
@@ -305,12 +318,12 @@ def _agreed_support(sides: Sequence[SilhouetteSides]) -> FloatArray:
     votes[np.arange(len(shape)), shape] += 0.5
     agreed = by_shape[np.arange(len(shape)), votes.argmax(axis=1)]
     straight = np.flatnonzero(votes.argmax(axis=1) == _STRAIGHT)
-    pixel = np.array([side.info.camera.spacing_m[1] for side in sides for _ in side.direction_rad])
+    cell_m = np.array([side.info.resolution_m[1] for side in sides for _ in side.direction_rad])
     flare = by_shape[:, _FLARED] - by_shape[:, _STRAIGHT]
     for index in straight:
         told_beside = flare[beside[index] & np.isfinite(flare)]
         stands_out = float(np.median(told_beside)) if len(told_beside) else 0.0
-        if stands_out > _FLARE_PX * pixel[index]:
+        if stands_out > _FLARE_CELLS * cell_m[index]:
             agreed[index] += stands_out
     return np.where(np.isnan(agreed), own, agreed)
 

@@ -146,6 +146,19 @@ class Body:
             while len(self._waiting) > _WAITING:
                 self._waiting.popitem(last=False)
 
+    def shape(self) -> tuple[VoxelGrid, VoxelGrid | None]:
+        """Return what carving leaves, and what the other method leaves if it was asked for.
+
+        Thin and faint bodies are too little for silhouettes and still darken the mean of all views, by which
+        the search finds them. Where silhouettes leave nothing, that mean tells what is there.
+        """
+        own = self.carver.grid()
+        other = self.other.grid() if self.other is not None and self.other.stamps else None
+        silhouettes = self.carver.parameters.takes_masks
+        if silhouettes and other is not None and other.occupied.any() and not own.occupied.any():
+            return other, own
+        return own, other
+
     def known_sides(self) -> list[SilhouetteSides]:
         """Return the sides of the views in the grid; of a silhouette that came alone it tells them itself."""
         for stamp, kept in self._masks.items():
@@ -377,7 +390,10 @@ class Reconstruction:
         )
         if self.stamps:
             body = self.bodies[0]
-            result.grid = body.carver.grid() if final else body.carver.first_look()
+            if final:
+                result.grid, result.other_grid = body.shape()
+            else:
+                result.grid = body.carver.first_look()
             result.timings_s["carve"] = time.perf_counter() - began
             if not final:
                 result.mesh, result.dimensions = _measured(result.grid, (), final=False)
@@ -407,9 +423,9 @@ class Reconstruction:
         if result.grid is None:
             return
         result.sides = _over_seabed(result.grid, body.known_sides())
-        result.mesh, result.dimensions = _measured(result.grid, result.sides, final=True)
-        if body.other is not None and body.other.stamps:
-            result.other_grid = body.other.grid()
+        result.mesh, result.dimensions = _measured(
+            result.grid, () if result.by_likelihood_alone else result.sides, final=True
+        )
         heights = {}
         if (found := result.dimensions) is not None:
             heights = {side.info.stamp_ns: shadow_height(side, found) for side in result.sides}

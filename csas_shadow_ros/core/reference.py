@@ -158,7 +158,7 @@ def silhouette(
     ndarray of uint8, shape (rows, cols)
         255 shadow, 0 outside, 64 covered, 128 unknown.
     """
-    shadow = shadow_patches(dark_pixels(view, sigma_r, sigma_s), view.info.camera, target_m, reach_m)
+    shadow = shadow_patches(dark_pixels(view, sigma_r, sigma_s), view.info, target_m, reach_m)
     echo = echo_pixels(view, sigma_r, echo_db)
     covered = covered_pixels(shadow, echo, view.info, target_m, reach_m)
     rows, cols = view.info.camera.shape
@@ -180,12 +180,22 @@ def mean_power(amplitude: NDArray[np.float64], v: int, u: int, half: tuple[int, 
     return float(np.mean(box[np.isfinite(box)] ** 2))
 
 
+def box_px(half_cells: tuple[float, float], info: ViewInfo) -> tuple[int, int]:
+    """Return the half-size (rows, cols) of a box in pixels, from resolution cells (down-range, across).
+
+    At least one pixel, at most the view.
+    """
+    cell_m, pixel_m, shape = info.resolution_m, info.camera.spacing_m, info.camera.shape
+    rows = round(min(half_cells[0] * cell_m[0] / pixel_m[0], shape[0]))
+    cols = round(min(half_cells[1] * cell_m[1] / pixel_m[1], shape[1]))
+    return max(rows, 1), max(cols, 1)
+
+
 def dark_pixels(view: View, sigma_r: float, sigma_s: float) -> NDArray[np.bool_]:
     """Mark the pixels that are shadow rather than seabed (section 4.1).
 
     Dark is where the mean power is less than 0.37 of the way from the shadow's, 2σ_s², to the seabed's,
-    2σ_r². The mean is over 1.8 resolution cells down-range and 0.75 across, to either side, and over 1 to 8
-    pixels.
+    2σ_r². The mean is over 1.8 resolution cells down-range and 0.75 across, to either side.
 
     Parameters
     ----------
@@ -199,9 +209,7 @@ def dark_pixels(view: View, sigma_r: float, sigma_s: float) -> NDArray[np.bool_]
     ndarray of bool, shape (rows, cols)
     """
     amplitude = view.pixels.astype(np.float64)
-    cell_m, pixel_m = view.info.resolution_m, view.info.camera.spacing_m
-    down = min(max(round(1.8 * cell_m[0] / pixel_m[0]), 1), 8)
-    across = min(max(round(0.75 * cell_m[1] / pixel_m[1]), 1), 8)
+    down, across = box_px((1.8, 0.75), view.info)
     threshold = 2 * sigma_s**2 + 0.37 * (2 * sigma_r**2 - 2 * sigma_s**2)
     rows, cols = amplitude.shape
     low = np.zeros((rows, cols), bool)
@@ -220,20 +228,20 @@ def dark_pixels(view: View, sigma_r: float, sigma_s: float) -> NDArray[np.bool_]
 
 
 def shadow_patches(
-    dark: NDArray[np.bool_], camera: ShadowCamera, target_m: tuple[float, float], reach_m: float
+    dark: NDArray[np.bool_], info: ViewInfo, target_m: tuple[float, float], reach_m: float
 ) -> NDArray[np.bool_]:
     """Keep the dark patches that begin at the target (section 4.1).
 
     Pixels that touch, corners too, are one patch. It begins at the target if any of it lies within reach of
-    it, or a little farther down-range, by the shadow of a quarter of the reach. Fewer than 25 pixels are
-    speckle.
+    it, or a little farther down-range, by the shadow of a quarter of the reach. Less than 5.6 resolution
+    cells are speckle.
 
     Parameters
     ----------
     dark : ndarray of bool, shape (rows, cols)
         Dark pixels.
-    camera : ShadowCamera
-        The view's geometry.
+    info : ViewInfo
+        The view.
     target_m : (float, float)
         Ground position (x, y) of the target, metres.
     reach_m : float
@@ -243,6 +251,8 @@ def shadow_patches(
     -------
     ndarray of bool, shape (rows, cols)
     """
+    camera = info.camera
+    least = 5.6 * info.resolution_m[0] * info.resolution_m[1] / camera.spacing_m[0] / camera.spacing_m[1]
     target_u, target_v = ground_pixel(target_m, camera)
     row_m, col_m = camera.spacing_m
     top, bottom = target_v - reach_m / row_m, target_v + reach_m / row_m
@@ -268,14 +278,16 @@ def shadow_patches(
             begins_here = any(
                 math.floor(top) <= a <= bottom and math.floor(left) <= b <= right for a, b in patch
             )
-            if begins_here and len(patch) >= 25:
+            if begins_here and len(patch) >= least:
                 for pixel in patch:
                     kept[pixel] = True
     return kept
 
 
 def echo_pixels(view: View, sigma_r: float, echo_db: float) -> NDArray[np.bool_]:
-    """Mark echoes: where the mean power of 3×3 pixels is `echo_db` over the seabed's, and one pixel round.
+    """Mark echoes: where the mean power of a box is `echo_db` over the seabed's, and all of that box.
+
+    It reaches 0.6 resolution cells to either side down-range, 0.375 across.
 
     Parameters
     ----------
@@ -292,13 +304,14 @@ def echo_pixels(view: View, sigma_r: float, echo_db: float) -> NDArray[np.bool_]
     """
     amplitude = view.pixels.astype(np.float64)
     threshold = 2 * sigma_r**2 * 10 ** (echo_db / 10)
+    down, across = box_px((0.6, 0.375), view.info)
     rows, cols = amplitude.shape
     echo = np.zeros((rows, cols), bool)
     for v in range(rows):
         for u in range(cols):
-            if math.isfinite(amplitude[v, u]) and mean_power(amplitude, v, u, (1, 1)) > threshold:
+            if math.isfinite(amplitude[v, u]) and mean_power(amplitude, v, u, (down, across)) > threshold:
                 # The flank of an echo is neither seabed nor shadow.
-                echo[max(0, v - 1) : v + 2, max(0, u - 1) : u + 2] = True
+                echo[max(0, v - down) : v + down + 1, max(0, u - across) : u + across + 1] = True
     return echo
 
 
@@ -314,8 +327,8 @@ def covered_pixels(
     It reaches from the farthest echo within reach of the target to the shadow. A side along range, g long, is
     smeared by g/2 tan(w/2) to either side by the aperture w: a stretch of shadow that lies no farther inside
     than that is led up to by no more than g, or by its own length where that is more. An edge that glitters
-    has gaps: echoes up to two columns beside count. The two pixels before the shadow, its flank, are covered
-    without any echo.
+    has gaps: echoes up to 0.75 resolution cells beside count. The 1.2 cells before the shadow, its flank, are
+    covered without any echo.
 
     Parameters
     ----------
@@ -335,6 +348,8 @@ def covered_pixels(
     row_m, col_m = info.camera.spacing_m
     near_end = int(ground_pixel(target_m, info.camera)[1] - reach_m / row_m)
     rows_a_column = 2 * col_m / (row_m * math.tan(info.aperture_rad / 2))
+    flank = max(1, round(1.2 * info.resolution_m[0] / row_m))
+    beside = max(1, round(0.75 * info.resolution_m[1] / col_m))
     rows, cols = shadow.shape
     covered = np.zeros((rows, cols), bool)
     for u in range(cols):
@@ -354,9 +369,9 @@ def covered_pixels(
                 inside = max(inside, min(u - left, right - u))
             smeared = start - int(inside * rows_a_column)
             farthest = max(0, min(start - (end - start), max(near_end, smeared)))
-            begin = max(farthest, start - 2)
+            begin = max(farthest, start - flank)
             for v in range(farthest, start):
-                if echo[v, max(0, u - 2) : u + 3].any():
+                if echo[v, max(0, u - beside) : u + beside + 1].any():
                     begin = min(begin, v)
             covered[begin:start, u] = True
     return covered

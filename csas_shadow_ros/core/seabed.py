@@ -28,8 +28,8 @@ from .geometry import ShadowCamera, View, ViewInfo, cross_range_axis, down_range
 
 #: Values of a shadow mask that are needed here (`carving.MASK_UNKNOWN`, `carving.MASK_SHADOW`).
 _UNKNOWN, _SHADOW = 128, 255
-#: The far end's place across is the mean over so many rows of shadow (pixels).
-_END_ROWS = 4
+#: The far end's place across is the mean over so much of the shadow (resolution cells down-range).
+_END_CELLS = 2.4
 #: Harmonics of the support function: a square top has corners.
 _HARMONICS = 6
 #: Fewer far ends, or less of a circle, tell no slope.
@@ -140,7 +140,8 @@ def shadow_end(mask: View) -> ShadowEnd | None:
     last = int(rows[-1])
     if last + 1 >= shadow.shape[0] or (mask.pixels[last + 1][shadow[last]] == _UNKNOWN).any():
         return None
-    columns = np.nonzero(shadow[max(int(rows[0]), last + 1 - _END_ROWS) : last + 1])[1]
+    end_rows = max(1, round(_END_CELLS * mask.info.cell_px[0]))
+    columns = np.nonzero(shadow[max(int(rows[0]), last + 1 - end_rows) : last + 1])[1]
     x, y, _ = mask.info.camera.pixel_to_ground @ np.array([columns.mean(), last + 0.5, 1.0])
     return ShadowEnd(mask.info, (float(x), float(y)))
 

@@ -18,7 +18,7 @@ from .errors import ViewError
 from .geometry import View, ViewInfo
 from .kernels import kernel
 from .likelihood import Levels, view_levels
-from .masks import BESIDE, FLANK_PX, MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
+from .masks import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, beside_px, flank_px
 from .parameters import LikelihoodParameters
 
 #: Shadow where the local mean power is less than this far from the shadow's level to the seabed's. At a
@@ -28,13 +28,12 @@ _DARK = 0.37
 #: The box's half-size in resolution cells, down-range and across. A shadow is several times as long as
 #: the target is high: down-range, averaging costs little resolution in height.
 _HALF_CELLS = (1.8, 0.75)
-#: The averaging box reaches no farther than this (pixels).
-_MAX_RADIUS = 8
-#: How far around the target is looked at first (pixels), and how much farther down-range, where shadows lie.
+#: How far around the target is looked at first (pixels), and how much farther down-range, where shadows lie:
+#: patches that lead out of it are followed.
 _MARGIN_PX = 16
 _LONGER = 8
-#: Smaller dark patches are speckle.
-_MIN_SHADOW_PIXELS = 25
+#: Smaller dark patches are speckle (resolution cells).
+_LEAST_CELLS = 5.6
 
 
 def dark_pixels(
@@ -51,10 +50,7 @@ def dark_pixels(
     rows, cols : slice
         The part of the view to look at, without steps: all of it.
     """
-    cells = zip(_HALF_CELLS, info.resolution_m, info.camera.spacing_m, strict=True)
-    down_px, across_px = (
-        int(min(max(round(half * cell / pixel), 1), _MAX_RADIUS)) for half, cell, pixel in cells
-    )
+    down_px, _ = levels.local.box_px(_HALF_CELLS)
     shadow_power = 1.0 / levels.contrast**2
     # A threshold below one half draws a straight edge across the box in by a known part of it: the far end
     # of the shadow, which tells the height, is put back.
@@ -62,7 +58,7 @@ def dark_pixels(
     first, last, _ = rows.indices(levels.known.shape[0])
     begin = max(0, first - drawn_in)
     threshold = shadow_power + _DARK * (1.0 - shadow_power)
-    dark = levels.local.under((down_px, across_px), threshold, slice(begin, last), cols)
+    dark = levels.local.under(_HALF_CELLS, threshold, slice(begin, last), cols)
     return np.asarray(_drawn_down(dark, drawn_in)[first - begin :] & levels.known[rows, cols])
 
 
@@ -115,15 +111,16 @@ def segment_shadow(
     _compose(levels.known.ravel(), echo.ravel(), mask.ravel())
     shadow, (top, left) = _of_target(levels, view.info, target_m, reach_m)
     if shadow.size:
-        # What is covered begins on the target, and is told by echoes two columns beside it.
+        # What is covered begins on the target, and is told by echoes beside it too.
         near_end = _near_end(view.info, target_m, reach_m)
         begin = max(0, min(top - len(shadow), near_end))
-        before = max(0, left - BESIDE)
+        beside = beside_px(view.info)
+        before = max(0, left - beside)
         rows, cols = slice(begin, top + len(shadow)), slice(left, left + shadow.shape[1])
         shadow = np.pad(shadow, ((top - begin, 0), (0, 0)))
         covered = np.zeros_like(shadow)
         if p.echo_unknown:
-            echoes = echo[rows, before : cols.stop + BESIDE]
+            echoes = echo[rows, before : cols.stop + beside]
             _before_shadow(shadow, echoes, left - before, view.info, near_end - begin, covered)
         _add_shadow(shadow, covered, mask[rows, cols])
     return replace(view, pixels=mask)
@@ -189,7 +186,7 @@ def _of_target(
             dark,
             (rows[0] - begin, rows[1] - begin),
             (cols[0] - first, cols[1] - first),
-            _MIN_SHADOW_PIXELS,
+            levels.local.pixels(_LEAST_CELLS),
             open_sides,
             out,
         )
@@ -326,13 +323,13 @@ def _before_shadow(
     stands up-range of row `near_end`.
     """
     # An edge that glitters has dark columns in it: its neighbours speak for them.
-    edge = cv2.dilate(echo.astype(np.uint8), np.ones((1, 2 * BESIDE + 1), np.uint8)).view(bool)
+    edge = cv2.dilate(echo.astype(np.uint8), np.ones((1, 2 * beside_px(info) + 1), np.uint8)).view(bool)
     inside = np.empty(shadow.shape, np.int32)
     _columns_inside(shadow, inside)
     row_m, col_m = info.camera.spacing_m
     rows_a_column = 2.0 * col_m / (row_m * max(math.tan(info.aperture_rad / 2.0), 1e-4))
     own = np.ascontiguousarray(edge[:, beside : beside + shadow.shape[1]])
-    _mark_before(np.ascontiguousarray(shadow), own, inside, rows_a_column, near_end, FLANK_PX, out)
+    _mark_before(np.ascontiguousarray(shadow), own, inside, rows_a_column, near_end, flank_px(info), out)
 
 
 def silhouette_found(mask: View) -> bool:

@@ -125,7 +125,9 @@ class VoxelCarverNodeParameters(
 ):
     """Parameters of `voxel_carver`; those of earlier stages measure the target and make further bodies."""
 
-    compare: bool = bounded(False, "carve by the other method too, from likelihood/*, on other_method/*")
+    compare: bool = bounded(
+        True, "carve by the other method too, on other_method/*; it finds what is too thin for silhouettes"
+    )
 
 
 @dataclass(frozen=True)

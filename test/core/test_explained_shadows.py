@@ -69,7 +69,7 @@ def test_a_low_wide_body_is_not_carved_by_its_own_lit_top():
 
 def test_taken_for_lit_seabed_its_top_would_carve_it():
     # What the test above would see if far covered pixels were not asked for.
-    near = [View(info, near_covered(mask_of(info).pixels)) for info in INFOS]
+    near = [near_covered(mask_of(info)) for info in INFOS]
     assert iou(carve(near, VOLUME, CarvingParameters()).occupied, box_voxels()) < 0.5
 
 
@@ -119,15 +119,19 @@ def test_what_a_body_does_not_cast_is_unexplained():
 
 
 def test_near_covered_pixels_are_those_within_a_stretchs_own_length():
-    mask = np.zeros((40, 9), np.uint8)
+    info = make_info(0.0, size=40)
+    cells = info.cell_px
+    flank, beside = round(1.2 * cells[0]), round(0.75 * cells[1])
+    assert (flank, beside) == (2, 2)
+    mask = np.zeros((40, 40), np.uint8)
     mask[2, :] = MASK_UNKNOWN
     mask[3:20, :] = MASK_COVERED
     mask[20:30, :] = MASK_SHADOW
-    near = near_covered(mask)
+    near = near_covered(View(info, mask)).pixels
     assert (near[3:18] == MASK_OUTSIDE).all()  # no echo within ten rows: the flank alone
     assert (near[18:20] == MASK_COVERED).all()
     mask[12, 4] = MASK_UNKNOWN
-    near = near_covered(mask)
+    near = near_covered(View(info, mask)).pixels
     assert (near[13:20, 2:7] == MASK_COVERED).all()  # it speaks for two columns on either side
     assert (near[3:12] == MASK_OUTSIDE).all()
     assert (near[13:18, 7:] == MASK_OUTSIDE).all()

@@ -13,7 +13,7 @@ from csas_shadow_ros.core import pipeline
 from csas_shadow_ros.core.geometry import Acoustics, ShadowCamera, ViewInfo
 from csas_shadow_ros.core.hollows import EchoLook, matter_mesh, matter_of
 from csas_shadow_ros.core.likelihood import Levels
-from csas_shadow_ros.core.local_means import LocalMeans
+from csas_shadow_ros.core.local_means import ECHO_CELLS, LocalMeans
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.stages import run_views
 from csas_shadow_ros.core.volume import Volume, VoxelGrid
@@ -82,7 +82,7 @@ def look_at(body, info, silent=None):
     mean[v[seen & answers], u[seen & answers]] = 1.0
     coarse = rng.exponential(size=tuple(n // 2 + 1 for n in camera.shape)).repeat(2, 0).repeat(2, 1)
     power = (mean * coarse[: camera.shape[0], : camera.shape[1]]).astype(np.float32)
-    levels = Levels(1.0, 4.0, 0.1, True, LocalMeans(power, np.ones(camera.shape, bool)))
+    levels = Levels(1.0, 4.0, 0.1, True, LocalMeans(power, np.ones(camera.shape, bool), info.cell_px))
     return EchoLook.of(levels, info, VOLUME)
 
 
@@ -141,12 +141,13 @@ def test_a_look_holds_the_same_bits_round_the_target_as_the_whole_view_and_is_sm
     rng = np.random.default_rng(3)
     known = rng.random(info.camera.shape) < 0.95
     power = np.where(known, rng.exponential(size=known.shape), 0.0).astype(np.float32)
-    levels = Levels(1.0, 4.0, 0.1, True, LocalMeans(power, known))
+    levels = Levels(1.0, 4.0, 0.1, True, LocalMeans(power, known, info.cell_px))
     look = EchoLook.of(levels, info, VOLUME)
     whole = EchoLook.of(levels, info, Volume.around(MIDDLE, (20.0, 20.0, 0.3), 0.1))
     assert whole.shape == info.camera.shape
     (v, u), (rows, cols) = look.first, look.shape
-    inner = (slice(1, -1), slice(1, -1))  # the 3×3 mean reaches one pixel out
+    half = levels.local.box_px(ECHO_CELLS)  # so far the box of the mean reaches out
+    inner = tuple(slice(n, -n) for n in half)
     for part, full in zip(look.pixels(), whole.pixels(), strict=True):
         assert np.array_equal(part[inner], full[v : v + rows, u : u + cols][inner])
     assert rows * cols < 0.1 * known.size

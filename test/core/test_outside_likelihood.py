@@ -192,7 +192,7 @@ def test_levels_given_are_levels_used():
 def mask_of(amplitude, echo_db=8.0):
     known = np.isfinite(amplitude)
     power = (np.nan_to_num(amplitude).astype(np.float32) ** 2 / 2).astype(np.float32)
-    return echo_mask(LocalMeans(power, known), echo_db)
+    return echo_mask(LocalMeans(power, known, (1.67, 2.66)), echo_db)
 
 
 def test_a_bright_patch_is_an_echo_and_speckle_is_not():

@@ -86,7 +86,27 @@ def test_silhouettes_alone_are_measured_by_themselves(whole):
     found = alone.result()
     assert np.array_equal(found.grid.occupied, result.grid.occupied)
     assert found.matter is None
-    assert found.dimensions.length_m == pytest.approx(result.dimensions.length_m, abs=0.03)
+    # To a resolution cell: a mask tells its edges to a pixel, levels to a fraction of one.
+    cell_m = views[0].mask.info.resolution_m[1]
+    assert found.dimensions.length_m == pytest.approx(result.dimensions.length_m, abs=cell_m)
+
+
+def test_what_silhouettes_are_too_little_for_is_carved_from_the_mean_likelihood(whole):
+    result, views = whole
+    again = Reconstruction(replace(result.decision, others=()), COARSE, compose=False)
+    for number, view in enumerate(views):
+        # Speckle: silhouettes that no two views agree on.
+        shift = (-12, 12)[number % 2]
+        mask = replace(view.mask, pixels=np.roll(view.mask.pixels, shift, axis=1))
+        again.add(ProcessedView(result.target, COARSE, shadow_mask=mask, likelihood=view.likelihood))
+    found = again.result()
+    assert not found.other_grid.occupied.any()
+    assert found.grid.method == "soft"
+    assert np.array_equal(found.grid.occupied, result.other_grid.occupied)
+    assert found.verdict == "object"
+    assert found.quality.verdict != "good"
+    assert any("mean likelihood of all views" in reason for reason in found.quality.reasons)
+    assert not found.dimensions.intervals
 
 
 def test_a_body_is_given_up_only_where_nothing_can_be_left_of_it(whole):

@@ -55,6 +55,12 @@ class ViewInfo:
         cross = 2.0 * mid * math.sin(min(self.aperture_rad, math.pi) / 2.0)
         return TWO_PI / (high - low), TWO_PI / cross if cross > 0 else math.inf
 
+    @property
+    def cell_px(self) -> tuple[float, float]:
+        """Pixels a resolution cell, (down-range, cross-range); the view's at most."""
+        cell, pixel, shape = self.resolution_m, self.camera.spacing_m, self.camera.shape
+        return min(cell[0] / pixel[0], shape[0]), min(cell[1] / pixel[1], shape[1])
+
     def down_range_of_rows(self) -> FloatArray:
         """Down-range e_r · p (m) of each row's centre, shape (rows,)."""
         e_r = down_range_axis(self.aspect_rad)

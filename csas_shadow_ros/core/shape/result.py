@@ -151,7 +151,8 @@ class Result:
     sign : SignEvidence or None
         Whether the shadows fit the spectrum sign; None if it was not checked.
     grid, other_grid : VoxelGrid or None
-        By the chosen method, and by the other one (where it was asked for).
+        By the chosen method, and by the other one (where it was asked for). Where silhouettes leave nothing
+        and the mean likelihood of all views leaves an object, the grid is by that.
     mesh, dimensions : trimesh.Trimesh, Dimensions or None
         Surface and measures of the object.
     matter : ndarray of bool, shape (nz, ny, nx), or None
@@ -209,6 +210,14 @@ class Result:
     further: list[ObjectResult] = field(default_factory=list)
     left_out: list[LeftOut] = field(default_factory=list)
     timings_s: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def by_likelihood_alone(self) -> bool:
+        """Whether the mean likelihood of all views tells of an object that silhouettes are too little for."""
+        grid, other = self.grid, self.other_grid
+        if grid is None or other is None or grid.method != "soft":
+            return False
+        return bool(grid.occupied.any()) and not other.occupied.any()
 
     @property
     def objects(self) -> list[ObjectResult]:

@@ -79,6 +79,12 @@ def judge(result: Result) -> None:
             reasons.append(f"{refused} of {refused + result.views_used} views were not used: {first}")
             worst = max(worst, 1)
         worst = max(worst, _fit_of(result, reasons))
+        if result.by_likelihood_alone:
+            reasons.append(
+                "its shadow is too thin or too faint to segment in single views: carved from the mean"
+                " likelihood of all views, sizes are rough"
+            )
+            worst = max(worst, 1)
         if result.final and result.dimensions is not None and not result.dimensions.intervals:
             reasons.append("too few sides of shadows were seen for intervals")
             worst = max(worst, 1)
