@@ -1,6 +1,6 @@
 from .bags import Run, check_bag, read_run, write_run
 from .core.errors import CsasError, InputTypeError, MissingExtraError, ParameterError
-from .core.geometry import Acoustics, CoherentImage, GroundGrid, Track, View
+from .core.geometry import Acoustics, CoherentImage, Datum, GroundGrid, Track, View
 from .core.mesh import Dimensions
 from .core.parameters import PipelineParameters
 from .core.shape.result import Quality, Result
@@ -14,6 +14,7 @@ __all__ = [
     "Acoustics",
     "CoherentImage",
     "CsasError",
+    "Datum",
     "Dimensions",
     "Faults",
     "GroundGrid",

@@ -16,7 +16,8 @@ from typing import Any, NoReturn
 
 from . import __version__
 from .core.errors import CsasError, ParameterError
-from .core.parameters import STAGES, START_FROM, PipelineParameters
+from .core.geometry.frames import SCENE_FRAME
+from .core.parameters import STAGES, START_FROM, PipelineParameters, PlaceParameters
 
 PROGRAM = "csas-shadow"
 ALL_RUNS = "all"
@@ -113,8 +114,9 @@ def _number_help(field: dataclasses.Field[Any]) -> str:
     elif isinstance(default, bool):
         default = "on" if default else "off"
     elif isinstance(default, float):
-        default = f"{default:g}"
-    parts.append(f"default {default}{unit if meta['low'] is not None else ''}")
+        default = "none" if math.isnan(default) else f"{default:g}"
+    with_unit = meta["low"] is not None and default != "none"
+    parts.append(f"default {default}{unit if with_unit else ''}")
     return f"{meta['doc']} ({'; '.join(parts)})".replace("%", "%%")
 
 
@@ -364,6 +366,21 @@ def _simulate_options(p: argparse.ArgumentParser) -> None:
         metavar="DEG",
         help="aspect of the first pose (default 0)",
     )
+    place = p.add_argument_group("place on earth, for topic origin")
+    for flag, text in (
+        ("--origin-lat-deg", "latitude of the scene's origin, WGS-84 (default: no origin is written)"),
+        ("--origin-lon-deg", "its longitude"),
+        ("--origin-sigma-m", "its standard deviation, along east and north (default: not known)"),
+    ):
+        place.add_argument(
+            flag, type=float, metavar=flag.rpartition("-")[2].upper(), default=math.nan, help=text
+        )
+    place.add_argument(
+        "--scene-frame",
+        default=SCENE_FRAME,
+        metavar="NAME",
+        help=f"the scene's frame (default {SCENE_FRAME})",
+    )
     faults = p.add_argument_group("faults")
     faults.add_argument(
         "--contrast-db", type=float, default=15.0, metavar="DB", help="seabed over shadow level (default 15)"
@@ -568,6 +585,11 @@ def _simulate(arguments: argparse.Namespace, console: Console) -> int:
         sound_speed_error=arguments.sound_speed_error,
         seabed_slope_db=arguments.seabed_slope_db,
     )
+    datum = PlaceParameters(
+        origin_lat_deg=arguments.origin_lat_deg,
+        origin_lon_deg=arguments.origin_lon_deg,
+        origin_sigma_m=arguments.origin_sigma_m,
+    ).datum()
     start = time.perf_counter()
     with console.bar("simulating") as bar:
         run = simulate_bag(
@@ -586,6 +608,8 @@ def _simulate(arguments: argparse.Namespace, console: Console) -> int:
             encoding=arguments.encoding,
             overwrite=arguments.overwrite,
             sectors_deg=arguments.sectors,
+            datum=datum,
+            frame=arguments.scene_frame,
         )
     out = Path(arguments.out_bag)
     length, width, height = run.truth.dims_m

@@ -250,6 +250,7 @@ class _Host:
         self.name: str = node.get_name()
         self.instance = uuid.uuid4().hex[:12]
         self.messages = RclpyMessages()
+        self.scene_frame = ""
         self.counts: Counter[str] = Counter()
         self.inlets: list[Inlet] = []
         self.trouble = self.unable = self.target_stamp = ""

@@ -99,8 +99,11 @@ def reconstruct_run(
         "progress": progress,
     }
     if stage == "image":
-        return _from_image(run, parameters, spectrum_sign, on_source, notice, **how)
-    return _from_views(run, stage, parameters, spectrum_sign, on_source, notice, **how)
+        result = _from_image(run, parameters, spectrum_sign, on_source, notice, **how)
+    else:
+        result = _from_views(run, stage, parameters, spectrum_sign, on_source, notice, **how)
+    result.datum = parameters.place.datum(run.datum)
+    return result
 
 
 def choose_start(run: Run, start_from: str = "auto") -> Literal["image"] | Stage:

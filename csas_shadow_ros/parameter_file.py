@@ -47,6 +47,7 @@ _OWNER = {
     "shadow": "shadow_enhancement",
     "likelihood": "shadow_likelihood",
     "carving": "voxel_carver",
+    "place": "voxel_carver",
 }
 
 

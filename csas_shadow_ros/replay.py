@@ -361,7 +361,7 @@ def node_parameters(
         "sub_aperture": of(p.sub_aperture, p.target) | {"max_objects": max_objects},
         "shadow_enhancement": of(p.shadow) | place,
         "shadow_likelihood": of(p.likelihood) | box,
-        "voxel_carver": of(p.shadow, p.likelihood, p.carving) | box,
+        "voxel_carver": of(p.shadow, p.likelihood, p.carving, p.place) | box,
     }
 
 

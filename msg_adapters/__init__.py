@@ -35,12 +35,14 @@ from .messages import (
     RclpyMessages,
     RosbagsMessages,
     data_stamp_to_ns,
+    frame_of,
     message_from_cdr,
     stamp_from_ns,
     stamp_to_ns,
     type_name_of,
 )
 from .objects import ObjectBox, objects_from_msg, objects_to_msg
+from .origin import origin_from_msg, origin_to_msg, scene_transform_to_msg
 from .pairs import (
     Pairer,
     coherent_image_from_msgs,
@@ -125,6 +127,7 @@ __all__ = [
     "display_to_msg",
     "evidence_from_msg",
     "evidence_to_msg",
+    "frame_of",
     "ground_info_from_msg",
     "ground_info_to_msg",
     "ground_picture_from_msgs",
@@ -141,6 +144,8 @@ __all__ = [
     "object_prefix",
     "objects_from_msg",
     "objects_to_msg",
+    "origin_from_msg",
+    "origin_to_msg",
     "pixels_from_msg",
     "prefixed",
     "progress_from_msg",
@@ -148,6 +153,7 @@ __all__ = [
     "quantise",
     "result_from_msgs",
     "result_to_msgs",
+    "scene_transform_to_msg",
     "sector_from_msgs",
     "sector_info_from_msg",
     "sector_info_to_msg",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from csas_shadow_ros.core.errors import AdapterError, CsasError
 from csas_shadow_ros.core.geometry import (
+    SCENE_FRAME,
     TWO_PI,
     Acoustics,
     GroundGrid,
@@ -27,8 +28,8 @@ from csas_shadow_ros.core.volume import Volume
 from .messages import (
     MAX_COORDINATE_M,
     MessageFactory,
-    check_frame,
     check_type,
+    frame_of,
     make_header,
     quoted,
     stamp_to_ns,
@@ -61,11 +62,14 @@ class GroundInfo:
         Its lattice.
     acoustics : Acoustics
         Its band.
+    frame : str
+        Name of the scene frame.
     """
 
     stamp_ns: int
     grid: GroundGrid
     acoustics: Acoustics
+    frame: str = field(default=SCENE_FRAME, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,7 @@ class SectorInfo(GroundInfo):
             sector.aspect_rad,
             sector.aperture_rad,
             sector.carrier_rad_m,
+            frame=sector.frame,
         )
 
 
@@ -214,6 +219,7 @@ def _make_ground(factory: MessageFactory, stamp_ns: int, grid: GroundGrid, model
 
 def ground_info_to_msg(factory: MessageFactory, info: GroundInfo) -> Any:
     """Make the CameraInfo of a ground-plane image (`csas_image`)."""
+    factory = factory.in_frame(info.frame)
     return _make_ground(factory, info.stamp_ns, info.grid, CSAS_IMAGE, _band(info.acoustics))
 
 
@@ -227,16 +233,16 @@ def ground_info_from_msg(msg: Any, stream_name: str = "image") -> GroundInfo:
     """
     where = stream(stream_name).info_topic
     check_type(msg, CAMERA_INFO, where)
-    check_frame(msg, where)
+    frame = frame_of(msg, where)
     d = _entries(msg, (CSAS_IMAGE,), where)
     stamp = stamp_to_ns(msg.header.stamp, f"{where}.header.stamp")
-    return GroundInfo(stamp, _ground_grid(msg, where), _acoustics(d, where))
+    return GroundInfo(stamp, _ground_grid(msg, where), _acoustics(d, where), frame=frame)
 
 
 def sector_info_to_msg(factory: MessageFactory, info: SectorInfo) -> Any:
     """Make the CameraInfo of a sector (`csas_sector`)."""
     d = [*_band(info.acoustics), info.aspect_rad, info.aperture_rad, *info.carrier_rad_m, math.nan]
-    return _make_ground(factory, info.stamp_ns, info.grid, CSAS_SECTOR, d)
+    return _make_ground(factory.in_frame(info.frame), info.stamp_ns, info.grid, CSAS_SECTOR, d)
 
 
 def sector_info_from_msg(msg: Any) -> SectorInfo:
@@ -249,10 +255,11 @@ def sector_info_from_msg(msg: Any) -> SectorInfo:
     """
     where = stream("sector").info_topic
     check_type(msg, CAMERA_INFO, where)
-    check_frame(msg, where)
+    frame = frame_of(msg, where)
     d = _entries(msg, (CSAS_SECTOR,), where)
     stamp = stamp_to_ns(msg.header.stamp, f"{where}.header.stamp")
-    return SectorInfo(stamp, _ground_grid(msg, where), _acoustics(d, where), *_aperture(d, where))
+    grid, acoustics = _ground_grid(msg, where), _acoustics(d, where)
+    return SectorInfo(stamp, grid, acoustics, *_aperture(d, where), frame=frame)
 
 
 def view_info_to_msg(factory: MessageFactory, info: ViewInfo, stream_name: str) -> Any:
@@ -274,6 +281,7 @@ def view_info_to_msg(factory: MessageFactory, info: ViewInfo, stream_name: str) 
         *info.carrier_rad_m,
         info.focus_range_m,
     ]
+    factory = factory.in_frame(info.frame)
     return _make(
         factory, info.stamp_ns, info.camera.shape, kind.distortion_model, d, k, r, info.camera.projection
     )
@@ -291,7 +299,7 @@ def view_info_from_msg(msg: Any, stream_name: str) -> ViewInfo:
     kind = stream(stream_name)
     where = kind.info_topic
     check_type(msg, CAMERA_INFO, where)
-    check_frame(msg, where)
+    frame = frame_of(msg, where)
     d = _entries(msg, (kind.distortion_model,), where)
     acoustics = _acoustics(d, where)
     aspect, aperture, carrier = _aperture(d, where)
@@ -320,7 +328,7 @@ def view_info_from_msg(msg: Any, stream_name: str) -> ViewInfo:
             f" says {math.degrees(aspect):.1f}; expected the two to agree within {math.degrees(slack):.1f}"
         )
     stamp = stamp_to_ns(msg.header.stamp, f"{where}.header.stamp")
-    return ViewInfo(stamp, camera, acoustics, aspect, aperture, carrier, float(d[8]))
+    return ViewInfo(stamp, camera, acoustics, aspect, aperture, carrier, float(d[8]), frame=frame)
 
 
 def voxel_info_to_msg(factory: MessageFactory, volume: Volume, stamp_ns: int) -> Any:
@@ -362,7 +370,7 @@ def voxel_info_from_msg(msg: Any, layers: int, stream_name: str = "voxel_grid") 
     """
     where = stream(stream_name).info_topic
     check_type(msg, CAMERA_INFO, where)
-    check_frame(msg, where)
+    frame_of(msg, where)
     d = _entries(msg, (CSAS_VOXEL_GRID,), where)
     grid = _ground_grid(msg, where)
     if abs(d[1] - grid.spacing_m) > 1e-6 * grid.spacing_m:
@@ -382,12 +390,13 @@ def check_pair(image: Any, info: Any, where: str = "image") -> None:
     Raises
     ------
     AdapterError
-        If their stamps or their sizes differ.
+        If their stamps, frames or sizes differ.
     """
     a = stamp_to_ns(image.header.stamp, f"{where}.header.stamp")
     b = stamp_to_ns(info.header.stamp, f"{where} camera_info.header.stamp")
     if a != b:
         raise AdapterError(f"{where}: camera_info is stamped {b} ns; expected the image's stamp, {a} ns")
+    frame_of(info, f"{where}: camera_info", frame_of(image, where))
     for name in ("width", "height"):
         x, y = int(getattr(image, name)), int(getattr(info, name))
         if x != y:

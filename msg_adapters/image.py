@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from csas_shadow_ros.core.errors import AdapterError
 
-from .messages import MessageFactory, check_frame, check_type, make_header, quoted
+from .messages import MessageFactory, check_type, frame_of, make_header, quoted
 from .topics import IMAGE, MATTER_ENCODING, VOXEL_ENCODING, ImageStream, stream
 
 MAX_SIDE = 1 << 16
@@ -145,7 +145,7 @@ def image_from_msg(msg: Any, stream_name: str) -> NDArray[Any]:
     """
     kind = stream(stream_name)
     pixels = pixels_from_msg(msg, kind.encodings, kind.image_topic)
-    check_frame(msg, kind.image_topic)
+    frame_of(msg, kind.image_topic)
     check_pixels(pixels, kind)
     return pixels
 

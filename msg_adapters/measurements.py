@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from csas_shadow_ros.core.errors import AdapterError
+from csas_shadow_ros.core.errors import AdapterError, CsasError
+from csas_shadow_ros.core.geometry import SCENE_FRAME, Datum, Place
 from csas_shadow_ros.core.mesh import Dimensions
 from csas_shadow_ros.core.seabed import SeabedSlope
 from csas_shadow_ros.core.shape.result import QUALITIES, VERDICTS, LeftOut, ObjectResult, Quality, Result
 from csas_shadow_ros.core.volume import Target, VoxelGrid
 
-from .messages import MessageFactory, quoted
+from .messages import MessageFactory, frame_of, quoted
 from .progress import Level
 from .statuses import (
     RUN,
@@ -42,6 +43,9 @@ _OBJECT = "object"
 _OTHER = "other method"
 _TARGET = "target_"
 _SEPARATOR = "; "
+#: Fields of `Datum`, and what its covariance is made of.
+_DATUM = ("latitude_deg", "longitude_deg", "heading_deg", "altitude_m")
+_COVARIANCE = ("datum_variance_east_m2", "datum_variance_north_m2", "datum_covariance_m2")
 _LEVELS = dict(zip(QUALITIES, (Level.OK, Level.WARN, Level.ERROR), strict=True))
 #: Names of the values, by those of `Dimensions.intervals`.
 _KEYS = {
@@ -128,6 +132,8 @@ class Measurements:
         Of the voxels that hold matter, and of the object's others; None where no echo was looked at.
     left_out : tuple of LeftOut
         Bodies of the search that are no objects, and why.
+    frame, datum
+        See `Result`.
     """
 
     stamp_ns: int
@@ -146,6 +152,8 @@ class Measurements:
     matter_volume_m3: float | None = None
     hollow_volume_m3: float | None = None
     left_out: tuple[LeftOut, ...] = ()
+    frame: str = SCENE_FRAME
+    datum: Datum | None = None
 
 
 def numbered_objects(result: Result) -> dict[int, ObjectResult]:
@@ -201,11 +209,14 @@ def measurements_to_msg(factory: MessageFactory, result: Result, stamp_ns: int |
     level = _LEVELS[result.quality.verdict]
     statuses = [Status.of(RUN, _run_values(result), _run_line(result), level)]
     for number, one in numbered_objects(result).items():
-        statuses.append(Status.of(f"{_OBJECT} {number}", _object_values(one), _line(one.dimensions), level))
+        place = result.place_of(one.dimensions)
+        values = _object_values(one) | _place_values(place)
+        statuses.append(Status.of(f"{_OBJECT} {number}", values, _line(one.dimensions, place), level))
     if result.other_grid is not None:
         statuses.append(Status.of(_OTHER, _grid_values(result.other_grid)))
     statuses += left_out_statuses(result.left_out)
-    return statuses_to_msg(factory, result.stamp_ns if stamp_ns is None else stamp_ns, statuses)
+    stamp = result.stamp_ns if stamp_ns is None else stamp_ns
+    return statuses_to_msg(factory.in_frame(result.frame), stamp, statuses)
 
 
 def _reasons(quality: Quality) -> str:
@@ -217,9 +228,38 @@ def _run_line(result: Result) -> str:
     return f"{result.verdict}, {result.quality.verdict}" + (f": {reasons}" if reasons else "")
 
 
-def _line(d: Dimensions) -> str:
-    heading = math.degrees(d.heading_rad)
-    return f"{d.length_m:.3f} x {d.width_m:.3f} x {d.height_m:.3f} m, heading {heading:.1f} deg"
+def _line(d: Dimensions, place: Place | None) -> str:
+    size = f"{d.length_m:.3f} x {d.width_m:.3f} x {d.height_m:.3f} m"
+    if place is None:
+        return f"{size}, heading {math.degrees(d.heading_rad):.1f} deg"
+    return f"{size}, bearing {place.bearing_deg:.1f} deg, at {place}"
+
+
+def _datum_values(datum: Datum | None) -> dict[str, Value]:
+    """Return what the places of the objects go by, to the last digit."""
+    if datum is None:
+        return {}
+    values: dict[str, Value] = {f"datum_{name}": getattr(datum, name) for name in _DATUM}
+    if datum.covariance_m2 is not None:
+        values |= dict(zip(_COVARIANCE, datum.covariance_m2, strict=True))
+    return values
+
+
+def _datum_of(run: Status) -> Datum | None:
+    if "datum_latitude_deg" not in run:
+        return None
+    latitude, longitude, heading, altitude = run.reals(*(f"datum_{name}" for name in _DATUM))
+    east, north, both = run.reals(*_COVARIANCE) if _COVARIANCE[0] in run else (math.nan,) * 3
+    covariance = None if math.isnan(east) else (east, north, both)
+    try:
+        return Datum(latitude, longitude, heading, altitude, covariance)
+    except CsasError as error:
+        raise AdapterError(f"{_WHERE}, status {RUN!r}: {error}") from error
+
+
+def _place_values(place: Place | None) -> dict[str, Value]:
+    """Return an object's place for readers at large; it is worked out from the datum, not read back."""
+    return {} if place is None else dict(vars(place))
 
 
 def _run_values(result: Result) -> dict[str, Value]:
@@ -237,7 +277,7 @@ def _run_values(result: Result) -> dict[str, Value]:
         "arc_rad": result.arc_rad,
         "views": int(result.views_used),
     }
-    values |= sign_values(result.sign)
+    values |= sign_values(result.sign) | _datum_values(result.datum)
     if result.target is not None:
         values |= target_values(result.target, _TARGET)
     if result.grid is not None:
@@ -323,6 +363,8 @@ def measurements_from_msg(msg: Any) -> Measurements:
         matter_volume_m3=run.real("matter_volume_m3") if matter else None,
         hollow_volume_m3=run.real("hollow_volume_m3") if matter else None,
         left_out=left_out_of(statuses),
+        frame=frame_of(msg, _WHERE),
+        datum=_datum_of(run),
     )
 
 

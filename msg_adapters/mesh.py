@@ -8,7 +8,7 @@ import numpy as np
 
 from csas_shadow_ros.core.errors import AdapterError
 
-from .messages import MessageFactory, check_frame, check_type, make_header, point
+from .messages import MessageFactory, check_type, frame_of, make_header, point
 from .topics import MARKER
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def check_marker(msg: Any, kind: int, name: str, where: str) -> bool:
         return False
     if action != ADD:
         raise AdapterError(f"{where}.action is {action}; expected 0 (ADD), 2 (DELETE) or 3 (DELETEALL)")
-    check_frame(msg, where)
+    frame_of(msg, where)
     if int(msg.type) != kind:
         raise AdapterError(f"{where}.type is {msg.type}; expected {kind} ({name})")
     q = msg.pose.orientation

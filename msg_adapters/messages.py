@@ -17,14 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csas_shadow_ros.core.errors import AdapterError
+from csas_shadow_ros.core.geometry.frames import SCENE_FRAME as SCENE_FRAME
 
-SCENE_FRAME = "csas_scene"
 NANOSECONDS = 1_000_000_000
 #: ``builtin_interfaces/Time.sec`` is an int32.
 MAX_STAMP_NS = (1 << 31) * NANOSECONDS - 1
 
 #: Defaults that are not zero or empty in the common interfaces.
-_DEFAULTS: dict[str, dict[str, Any]] = {"geometry_msgs/msg/Quaternion": {"w": 1.0}}
+_DEFAULTS: dict[str, dict[str, Any]] = {
+    "geometry_msgs/msg/Quaternion": {"w": 1.0},
+    "sensor_msgs/msg/NavSatStatus": {"status": -2},
+}
 
 FLOAT_TYPES = ("float", "double", "float32", "float64")
 
@@ -54,6 +57,12 @@ def quoted(value: Any) -> str:
 class MessageFactory(Protocol):
     """What a writer needs to know of a message world."""
 
+    #: Frame of the headers that are made with it.
+    frame_id: str
+
+    def in_frame(self, frame_id: str) -> MessageFactory:
+        """Return the same factory for another frame."""
+
     def cls(self, type_name: str) -> Any:
         """Return the message class of a type such as ``sensor_msgs/msg/Image``."""
 
@@ -71,10 +80,25 @@ class MessageFactory(Protocol):
 
 
 class RclpyMessages:
-    """Messages of an installed ROS 2 (needs the message packages, not a running node)."""
+    """Messages of an installed ROS 2 (needs the message packages, not a running node).
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    frame_id : str
+        Frame of the headers that are made with it.
+    """
+
+    def __init__(self, frame_id: str = SCENE_FRAME) -> None:
+        self.frame_id = frame_id
         self._classes: dict[str, Any] = {}
+
+    def in_frame(self, frame_id: str) -> RclpyMessages:
+        """Return the same factory for another frame."""
+        if frame_id == self.frame_id:
+            return self
+        other = RclpyMessages(frame_id)
+        other._classes = self._classes
+        return other
 
     def cls(self, type_name: str) -> Any:
         """Return the message class of a type such as ``sensor_msgs/msg/Image``.
@@ -135,7 +159,20 @@ def _hand_over(message: Any, data: array.array[int]) -> None:
 
 
 class RosbagsMessages:
-    """Dataclass messages of the rosbags library (Jazzy definitions); no ROS needed."""
+    """Dataclass messages of the rosbags library (Jazzy definitions); no ROS needed.
+
+    Parameters
+    ----------
+    frame_id : str
+        Frame of the headers that are made with it.
+    """
+
+    def __init__(self, frame_id: str = SCENE_FRAME) -> None:
+        self.frame_id = frame_id
+
+    def in_frame(self, frame_id: str) -> RosbagsMessages:
+        """Return the same factory for another frame."""
+        return RosbagsMessages(frame_id)
 
     @staticmethod
     def _store() -> Any:
@@ -410,22 +447,42 @@ def stamp_from_ns(factory: MessageFactory, stamp_ns: int) -> Any:
     return factory.make("builtin_interfaces/msg/Time", sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS)
 
 
-def make_header(factory: MessageFactory, stamp_ns: int, frame_id: str = SCENE_FRAME) -> Any:
-    """Make a ``std_msgs/Header`` in the scene frame."""
-    return factory.make("std_msgs/msg/Header", stamp=stamp_from_ns(factory, stamp_ns), frame_id=frame_id)
+def make_header(factory: MessageFactory, stamp_ns: int) -> Any:
+    """Make a ``std_msgs/Header`` in the factory's frame."""
+    stamp = stamp_from_ns(factory, stamp_ns)
+    return factory.make("std_msgs/msg/Header", stamp=stamp, frame_id=factory.frame_id)
 
 
-def check_frame(msg: Any, where: str) -> None:
-    """Refuse a message that is not in the scene frame.
+#: tf2 and REP 103 set no limit; a name fits a line of the terminal with what was expected.
+_MAX_FRAME = 100
+
+
+def frame_of(msg: Any, where: str, expected: str = "") -> str:
+    """Return the frame that a message is in.
+
+    Parameters
+    ----------
+    msg : message with a header
+        Of either message world.
+    where : str
+        What it is, for errors.
+    expected : str
+        The one frame that it may be in; empty: any that has a name.
 
     Raises
     ------
     AdapterError
-        Naming the frame.
+        If it has none, or another one; the error names it.
     """
     frame = msg.header.frame_id
-    if frame != SCENE_FRAME:
-        raise AdapterError(f"{where}.header.frame_id is {quoted(frame)}; expected {SCENE_FRAME!r}")
+    if not isinstance(frame, str) or not frame.strip() or len(frame) > _MAX_FRAME:
+        raise AdapterError(
+            f"{where}.header.frame_id is {quoted(frame)}; expected the name of the scene's frame, such as"
+            f" {SCENE_FRAME!r}"
+        )
+    if expected and frame != expected:
+        raise AdapterError(f"{where}.header.frame_id is {quoted(frame)}; expected {expected!r}")
+    return frame
 
 
 def point(factory: MessageFactory, xyz: Any, type_name: str = "geometry_msgs/msg/Point") -> Any:

@@ -12,7 +12,7 @@ from csas_shadow_ros.core.shape.result import Result
 
 from .measurements import half_width, numbered_objects
 from .mesh import ADD, DELETE, DELETE_ALL, colour, marker
-from .messages import MessageFactory, check_frame, check_type, point, xyz_of
+from .messages import MessageFactory, check_type, frame_of, point, xyz_of
 from .target import CUBE
 from .topics import MARKERS
 
@@ -68,6 +68,7 @@ def objects_to_msg(
         If an object is nowhere or has no size.
     """
     stamp = result.stamp_ns if stamp_ns is None else stamp_ns
+    factory = factory.in_frame(result.frame)
     found = numbered_objects(result)
     markers: list[Any] = []
     for number, one in found.items():
@@ -156,7 +157,7 @@ def objects_from_msg(msg: Any) -> list[tuple[int, ObjectBox]]:
             continue
         if action != ADD:
             raise AdapterError(f"{where}.action is {action}; expected 0 (ADD), 2 (DELETE) or 3 (DELETEALL)")
-        check_frame(one, where)
+        frame_of(one, where)
         if int(one.type) != CUBE:
             raise AdapterError(f"{where}.type is {one.type}; expected {CUBE} (CUBE)")
         number = int(one.id)

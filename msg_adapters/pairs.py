@@ -42,16 +42,17 @@ def coherent_image_from_msgs(image: Any, info: Any) -> CoherentImage:
     check_pair(image, info, "image")
     data_stamp_to_ns(image.header.stamp, "image.header.stamp")
     ground = ground_info_from_msg(info)
-    return CoherentImage(image_from_msg(image, "image"), ground.grid, ground.acoustics, ground.stamp_ns)
+    pixels = image_from_msg(image, "image")
+    return CoherentImage(pixels, ground.grid, ground.acoustics, ground.stamp_ns, frame=ground.frame)
 
 
 def coherent_image_to_msgs(
     factory: MessageFactory, image: CoherentImage, encoding: str | None = None
 ) -> tuple[Any, Any]:
     """Make (Image, CameraInfo) of the full-circle image."""
-    info = GroundInfo(image.stamp_ns, image.grid, image.acoustics)
+    info = GroundInfo(image.stamp_ns, image.grid, image.acoustics, frame=image.frame)
     return (
-        image_to_msg(factory, image.pixels, image.stamp_ns, "image", encoding),
+        image_to_msg(factory.in_frame(image.frame), image.pixels, image.stamp_ns, "image", encoding),
         ground_info_to_msg(factory, info),
     )
 
@@ -68,13 +69,14 @@ def sector_from_msgs(image: Any, info: Any) -> Sector:
     data_stamp_to_ns(image.header.stamp, "sector/image.header.stamp")
     s = sector_info_from_msg(info)
     pixels = image_from_msg(image, "sector")
-    return Sector(pixels, s.grid, s.acoustics, s.stamp_ns, s.aspect_rad, s.aperture_rad, s.carrier_rad_m)
+    arc = s.aspect_rad, s.aperture_rad, s.carrier_rad_m
+    return Sector(pixels, s.grid, s.acoustics, s.stamp_ns, *arc, frame=s.frame)
 
 
 def sector_to_msgs(factory: MessageFactory, sector: Sector, encoding: str | None = None) -> tuple[Any, Any]:
     """Make (Image, CameraInfo) of a sector."""
     return (
-        image_to_msg(factory, sector.pixels, sector.stamp_ns, "sector", encoding),
+        image_to_msg(factory.in_frame(sector.frame), sector.pixels, sector.stamp_ns, "sector", encoding),
         sector_info_to_msg(factory, SectorInfo.of(sector)),
     )
 
@@ -99,6 +101,7 @@ def view_to_msgs(
 
     `trusted` as of `image_to_msg`: a stage's own views are looked at by whoever takes them.
     """
+    factory = factory.in_frame(view.info.frame)
     return (
         image_to_msg(factory, view.pixels, view.info.stamp_ns, stream_name, trusted=trusted),
         view_info_to_msg(factory, view.info, stream_name),
@@ -132,6 +135,7 @@ def ground_picture_to_msgs(
         raise AdapterError(
             f"{stream(stream_name).image_topic} has {pixels.shape[:2]} pixels; expected {info.grid.shape}"
         )
+    factory = factory.in_frame(info.frame)
     return (
         image_to_msg(factory, pixels, info.stamp_ns, stream_name),
         ground_info_to_msg(factory, info),

@@ -25,7 +25,7 @@ from .measurements import (
     numbered_objects,
 )
 from .mesh import mesh_from_msg, mesh_to_msg
-from .messages import MessageFactory, stamp_to_ns
+from .messages import MessageFactory, frame_of, stamp_to_ns
 from .objects import objects_to_msg
 from .pairs import voxel_grid_from_msgs, voxel_grid_to_msgs
 from .search import decision_from_msg
@@ -76,6 +76,7 @@ def result_to_msgs(
     AdapterError
         If something in the result has no place in its message.
     """
+    factory = factory.in_frame(result.frame)
     stamp = result.stamp_ns if stamp_ns is None else stamp_ns
     mesh = result.mesh
     yield from _shape(factory, "", result.grid, mesh, stamp, wanted)
@@ -182,7 +183,7 @@ def result_from_msgs(messages: Mapping[str, Any]) -> Result:
         If one is missing, breaks the contract, or carries another stamp than `measurements`.
     """
     told = measurements_from_msg(_message(messages, "measurements"))
-    reader = _Reader(messages, told.stamp_ns)
+    reader = _Reader(messages, told.stamp_ns, told.frame)
     objects = {one.number: one for one in told.objects}
     main = objects.pop(1, None)
     result = Result(
@@ -198,6 +199,8 @@ def result_from_msgs(messages: Mapping[str, Any]) -> Result:
         evidence=evidence_from_msg(reader.stamped("evidence")),
         further=[reader.object(one) for one in objects.values()],
         left_out=list(told.left_out),
+        frame=told.frame,
+        datum=told.datum,
     )
     if "search" in messages:
         result.decision = decision_from_msg(messages["search"]).decision
@@ -229,9 +232,10 @@ def _message(messages: Mapping[str, Any], topic: str) -> Any:
 
 
 class _Reader:
-    """Takes a result's parts out of messages of one stamp."""
+    """Takes a result's parts out of messages of one stamp and frame."""
 
-    def __init__(self, messages: Mapping[str, Any], stamp_ns: int) -> None:
+    def __init__(self, messages: Mapping[str, Any], stamp_ns: int, frame: str) -> None:
+        self._frame = frame
         self._messages = messages
         self._stamp_ns = stamp_ns
 
@@ -242,6 +246,7 @@ class _Reader:
             raise AdapterError(
                 f"{topic} is stamped {stamp} ns; expected the stamp of measurements, {self._stamp_ns} ns"
             )
+        frame_of(message, topic, self._frame)
         return message
 
     def values(self, name: str, facts: GridFacts) -> tuple[Volume, NDArray[Any]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from .messages import MessageFactory
+from .messages import MessageFactory, frame_of
 from .statuses import (
     RUN,
     Status,
@@ -89,6 +89,8 @@ def decision_to_msg(
     said = f"{len(bodies)} to carve, {len(decision.left_out)} left out"
     statuses = [Status.of(RUN, values, said)]
     statuses += [Status.of(f"{_BODY} {number}", target_values(body)) for number, body in bodies.items()]
+    if decision.frame is not None:
+        factory = factory.in_frame(decision.frame)
     return statuses_to_msg(factory, stamp_ns, [*statuses, *left_out_statuses(decision.left_out)])
 
 
@@ -106,6 +108,7 @@ def decision_from_msg(msg: Any) -> SearchNews:
     run = run_of(statuses, _WHERE)
     bodies = {number: target_of(status) for number, status in numbered(statuses, _BODY).items()}
     target = bodies.pop(1, None)
-    decision = Decision(target, tuple(bodies.values()), left_out_of(statuses), sign_of(run))
+    frame = frame_of(msg, _WHERE)
+    decision = Decision(target, tuple(bodies.values()), left_out_of(statuses), sign_of(run), frame)
     run_ns = run.whole("run") if "run" in run else None
     return SearchNews(stamp_ns, decision, run_ns, run.whole("target"), run.truth("may_move"))

@@ -15,7 +15,7 @@ from csas_shadow_ros.core.errors import AdapterError
 from csas_shadow_ros.core.shape.result import LeftOut
 from csas_shadow_ros.core.volume import Target
 
-from .messages import MessageFactory, check_frame, check_type, make_header, quoted, stamp_to_ns
+from .messages import MessageFactory, check_type, frame_of, make_header, quoted, stamp_to_ns
 from .progress import Level
 from .topics import DIAGNOSTICS
 
@@ -183,7 +183,7 @@ def statuses_from_msg(msg: Any, where: str) -> tuple[int, dict[str, Status]]:
         If it is another type of message or in another frame, two statuses have one name, or a level is none.
     """
     check_type(msg, DIAGNOSTICS, where)
-    check_frame(msg, where)
+    frame_of(msg, where)
     found: dict[str, Status] = {}
     for i, one in enumerate(msg.status):
         code = one.level[0] if isinstance(one.level, bytes) else int(one.level)

@@ -26,6 +26,8 @@ POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 MARKER = "visualization_msgs/msg/Marker"
 MARKERS = "visualization_msgs/msg/MarkerArray"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
 
 #: Encodings of complex pixels; integers come out as complex64.
 COMPLEX_ENCODINGS = ("32FC2", "8SC2", "16SC2", "64FC2")
@@ -213,7 +215,7 @@ def _topics() -> dict[str, Topic]:
             " somebody looks",
             encodings=("mono8",),
         ),
-        Topic("track", PATH, "sonar poses along the circle, stamped, in csas_scene"),
+        Topic("track", PATH, "sonar poses along the circle, stamped, in the scene's frame"),
         Topic("target", MARKER, "the carved volume as a CUBE; action DELETE: no object"),
         Topic("voxels", POINT_CLOUD, "voxels that may be object: x y z l_out views"),
         Topic("mesh", MARKER, "TRIANGLE_LIST of the thresholded surface; action DELETE: no object"),
@@ -226,6 +228,8 @@ def _topics() -> dict[str, Topic]:
         Topic("measurements", DIAGNOSTICS, "measures of each object, verdict and quality of the run"),
         Topic("evidence", DIAGNOSTICS, "what each view contributed to the grid: one status a view"),
         Topic("search", DIAGNOSTICS, "what is to be carved, and what is left out and why"),
+        Topic("origin", NAV_SAT_FIX, "where on earth the scene's origin is, and how sure that is"),
+        Topic("scene_transform", TRANSFORM, "the scene's frame in parent_frame, where there is a datum"),
         Topic("progress", DIAGNOSTICS, "what became of each view, and the nodes' heartbeats"),
         Topic("/diagnostics", DIAGNOSTICS, "views in, out, rejected and why, rates"),
     ]
@@ -256,6 +260,7 @@ _LATCHED_STREAMS = ("image", "multilook", "color_by_aspect", *VOXEL_STREAMS)
 #: Topics whose last message stays: whoever comes late gets it. Names without a prefix.
 LATCHED: frozenset[str] = frozenset(
     {"track", "target", "voxels", "mesh", "matter/mesh", "objects", "measurements", "evidence", "search"}
+    | {"origin", "scene_transform"}
     | {t for s in _LATCHED_STREAMS for t in (STREAMS[s].image_topic, STREAMS[s].info_topic)}
 )
 

@@ -15,11 +15,10 @@ from .messages import (
     MAX_COORDINATE_M,
     MAX_POSES,
     NANOSECONDS,
-    SCENE_FRAME,
     MessageFactory,
     PackedPath,
-    check_frame,
     check_type,
+    frame_of,
     make_header,
     point,
     quoted,
@@ -46,6 +45,7 @@ def track_to_msg(factory: MessageFactory, track: Track) -> Any:
     AdapterError
         If a stamp is no ROS time.
     """
+    factory = factory.in_frame(track.frame)
     identity = factory.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
     poses = [
         factory.make(
@@ -64,7 +64,7 @@ def track_from_msg(msg: Any, max_gap_rad: float = DEFAULT_MAX_GAP_RAD) -> Track:
     Parameters
     ----------
     msg : nav_msgs/Path
-        Of either message world; every pose stamped, in `csas_scene`.
+        Of either message world; every pose stamped, in the frame of its header or without one.
     max_gap_rad : float
         See `Track`.
 
@@ -73,9 +73,9 @@ def track_from_msg(msg: Any, max_gap_rad: float = DEFAULT_MAX_GAP_RAD) -> Track:
     AdapterError
         If a frame, a stamp or the positions are not usable as a track; the error names the pose.
     """
-    stamps, positions = _poses(msg)
+    stamps, positions, frame = _poses(msg)
     try:
-        return Track(stamps, positions, max_gap_rad=max_gap_rad)
+        return Track(stamps, positions, max_gap_rad=max_gap_rad, frame=frame)
     except CsasError as error:
         raise AdapterError(f"track.poses: {error}") from error
 
@@ -86,7 +86,7 @@ def track_piece_from_msg(msg: Any) -> TrackPiece:
     Parameters
     ----------
     msg : nav_msgs/Path
-        Of either message world; every pose stamped, in `csas_scene`.
+        Of either message world; every pose stamped, in the frame of its header or without one.
 
     Returns
     -------
@@ -100,7 +100,7 @@ def track_piece_from_msg(msg: Any) -> TrackPiece:
     AdapterError
         If a frame or a stamp is not usable, there is no pose, or more poses cannot be used.
     """
-    stamps, positions = _poses(msg)
+    stamps, positions, frame = _poses(msg)
     n = len(stamps)
     if not n:
         raise AdapterError("track.poses: track has 0 poses; expected at least 1")
@@ -151,7 +151,7 @@ def track_piece_from_msg(msg: Any) -> TrackPiece:
     notes = tuple(f"{bad[i]}: left out" for i in sorted(bad)[:MAX_NOTES])
     if len(bad) > MAX_NOTES:
         notes += (f"{len(bad) - MAX_NOTES} more track poses cannot be used: left out",)
-    return TrackPiece(stamps[kept], positions[kept], header_ns, notes)
+    return TrackPiece(stamps[kept], positions[kept], header_ns, notes, frame=frame)
 
 
 def _brief(xyz: NDArray[np.float64]) -> str:
@@ -173,38 +173,39 @@ def _far_in_time(stamps: NDArray[np.int64], good: list[int]) -> dict[int, str]:
     }
 
 
-def _poses(msg: Any) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _poses(msg: Any) -> tuple[NDArray[np.int64], NDArray[np.float64], str]:
     check_type(msg, PATH, "track")
-    check_frame(msg, "track")
-    stamps, positions = _packed(msg) if getattr(msg, "table", None) is not None else _one_by_one(msg)
+    frame = frame_of(msg, "track")
+    read = _packed if getattr(msg, "table", None) is not None else _one_by_one
+    stamps, positions = read(msg, frame)
     if len(stamps) > 1 and not stamps.any():
         raise AdapterError("track.poses: no pose is stamped (all are 0); expected when the sonar was there")
-    return stamps, positions
+    return stamps, positions, frame
 
 
-def _one_by_one(msg: Any) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _one_by_one(msg: Any, frame: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     n = len(msg.poses)
     if n > MAX_POSES:
         raise AdapterError(f"track has {n} poses; expected at most {MAX_POSES}")
     stamps = np.empty(n, np.int64)
     positions = np.empty((n, 3))
     for i, pose in enumerate(msg.poses):
-        _check_pose_frame(i, pose.header.frame_id)
+        _check_pose_frame(i, pose.header.frame_id, frame)
         stamps[i] = stamp_to_ns(pose.header.stamp, f"track.poses[{i}].header.stamp")
         p = pose.pose.position
         positions[i] = p.x, p.y, p.z
     return stamps, positions
 
 
-def _check_pose_frame(i: int, frame: str) -> None:
-    if frame not in ("", SCENE_FRAME):
-        raise AdapterError(f"track.poses[{i}].header.frame_id is {quoted(frame)}; expected {SCENE_FRAME!r}")
+def _check_pose_frame(i: int, frame: str, expected: str) -> None:
+    if frame not in ("", expected):
+        raise AdapterError(f"track.poses[{i}].header.frame_id is {quoted(frame)}; expected {expected!r}")
 
 
-def _packed(msg: PackedPath) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _packed(msg: PackedPath, expected: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     assert msg.table is not None
     times, positions, frame = msg.table
-    _check_pose_frame(0, frame)
+    _check_pose_frame(0, frame, expected)
     wrong = (times[:, 0] < 0) | (times[:, 1] >= NANOSECONDS)
     if wrong.any():
         i = int(wrong.argmax())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from csas_shadow_ros.core.errors import AdapterError
 from csas_shadow_ros.core.volume import VoxelGrid
 
-from .messages import MessageFactory, check_frame, check_type, make_header, quoted, stamp_to_ns
+from .messages import MessageFactory, check_type, frame_of, make_header, quoted, stamp_to_ns
 from .topics import POINT_CLOUD
 
 _POINT = np.dtype(
@@ -124,7 +124,7 @@ def voxels_from_msg(msg: Any, where: str = "voxels") -> Voxels:
         or a position is not finite.
     """
     check_type(msg, POINT_CLOUD, where)
-    check_frame(msg, where)
+    frame_of(msg, where)
     step, rows, cols = int(msg.point_step), int(msg.height), int(msg.width)
     order = ">" if msg.is_bigendian else "<"
     found: dict[str, tuple[str, int]] = {}

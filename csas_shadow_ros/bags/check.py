@@ -451,6 +451,13 @@ def _not_round(track: Track) -> str:
 
 def judge_image(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, str]]:
     """Yield (level, problem, remedy) for whatever image, camera_info and track contradict each other in."""
+    if track.frame != image.frame:
+        yield (
+            ERROR,
+            f"the track is in frame {track.frame!r}, the image in {image.frame!r}",
+            "Every message of a run carries one frame_id: correct that of the track or of the image.",
+        )
+        return
     yield from judge_geometry(image.grid, track)
     yield from judge_band(image.grid, image.acoustics, track)
     yield from judge_stuck(image)

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from csas_shadow_ros.core.errors import BagError, CsasError, check_type
-from csas_shadow_ros.core.geometry import CoherentImage, Track, View
+from csas_shadow_ros.core.geometry import CoherentImage, Datum, Origin, Track, View
 from csas_shadow_ros.core.sector import Sector, unlike
 from msg_adapters.camera_info import SectorInfo, sector_info_from_msg
 from msg_adapters.image import largest_part, quantise
-from msg_adapters.messages import RosbagsMessages
+from msg_adapters.messages import SCENE_FRAME, RosbagsMessages
+from msg_adapters.origin import origin_to_msg
 from msg_adapters.pairs import (
     coherent_image_from_msgs,
     coherent_image_to_msgs,
@@ -74,6 +75,8 @@ class Run:
         Name of the run: the stamp of its track's first pose. None without a track.
     run_names : tuple of int
         Names of all runs of the bag, in time.
+    datum : Datum or None
+        Where on earth the scene's origin is, if the bag says so.
     """
 
     path: Path
@@ -88,6 +91,7 @@ class Run:
     _reader: BagReader | None = None
     _sum: SectorSum | None = None
     _infos: list[SectorInfo] | None = None
+    datum: Datum | None = None
 
     @classmethod
     def of(cls, image: CoherentImage, track: Track) -> Run:
@@ -120,6 +124,8 @@ class Run:
         held += ["track"] if self.track is not None else []
         lines = [f"Run {where}: {', '.join(held) or 'nothing to start from'}"]
         lines += [f"  {part}".replace("\n", "\n  ") for part in (self.image, self.track) if part is not None]
+        if self.datum is not None:
+            lines.append(f"  {self.datum}")
         if len(self.run_names) > 1:
             lines.append(f"  one of {len(self.run_names)} runs")
         if self.problems:
@@ -197,6 +203,14 @@ class Run:
         if self.counts.get("sector"):
             return self.sector_sum().image()
         raise BagError(self.why("there is no full-circle image"))
+
+    @property
+    def frame(self) -> str:
+        """Name of the scene's frame: that of the track, the image, or the first sector or view."""
+        for part in (self.track, self.image):
+            if part is not None:
+                return part.frame
+        return SCENE_FRAME if self._runs is None else self._runs.frame
 
     def require_track(self) -> Track:
         """Return the track.
@@ -345,6 +359,8 @@ def read_run(path: str | Path, namespace: str | None = None, run: int | None = N
     result.track, notes = runs.track(image_ns, infos)
     for note in notes:
         result.report(Problem(runs.topic, None, None, note))
+    said = runs.origin(result.report)
+    result.datum = None if said is None else said[0].datum
     for line in reader.problems:
         result.report(Problem("", None, None, line))
     return result
@@ -383,6 +399,7 @@ def write_run(
     sectors: Iterable[Sector] = (),
     sector_times_ns: Mapping[int, int] | None = None,
     extra: Iterable[tuple[str, Any]] = (),
+    datum: Datum | None = None,
 ) -> Path:
     """Write a run as a rosbag2 directory that any ROS 2 tool opens.
 
@@ -409,6 +426,8 @@ def write_run(
         When each sector was made, by its stamp; its stamp otherwise. A player keeps to it.
     extra : iterable of (str, message)
         More stamped messages (rclpy or rosbags), by relative or absolute topic.
+    datum : Datum, optional
+        Where on earth the scene's origin is, for topic ``origin``.
 
     Returns
     -------
@@ -450,6 +469,12 @@ def write_run(
                 writer.add_topic(name(latched), TOPICS[latched].type_name, depth=1)
         if track is not None:
             writer.write(name("track"), track_to_msg(factory, track), when)
+        if datum is not None:
+            frame = next((part.frame for part in (track, image) if part is not None), SCENE_FRAME)
+            # Said before the run: its track may be cut, and is the earlier then.
+            first_ns = int(track.stamps_ns[0]) if track is not None else when
+            writer.add_topic(name("origin"), TOPICS["origin"].type_name, depth=1)
+            writer.write(name("origin"), origin_to_msg(factory, Origin(first_ns, frame, datum)), when)
         if integers:
             sectors = list(sectors)
             peak = max((largest_part(s.pixels) for s in sectors), default=0.0)

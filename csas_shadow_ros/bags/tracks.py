@@ -7,8 +7,10 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from csas_shadow_ros.core.errors import BagError, CsasError
-from csas_shadow_ros.core.geometry import Track, TrackBook, ViewInfo, passage
+from csas_shadow_ros.core.geometry import SCENE_FRAME, Origin, Track, TrackBook, ViewInfo, origin_of, passage
 from msg_adapters.camera_info import view_info_from_msg
+from msg_adapters.messages import frame_of, quoted
+from msg_adapters.origin import origin_from_msg
 from msg_adapters.topics import STREAMS, VIEW_STREAMS, absolute_name
 from msg_adapters.track import track_piece_from_msg
 
@@ -121,6 +123,33 @@ class BagRuns:
         named += f" and {len(spans) - 4} more" if len(spans) > 4 else ""
         tracks = "the track covers" if len(spans) == 1 else "the tracks cover"
         return f"no track covers {what}: {tracks} {named}"
+
+    @property
+    def frame(self) -> str:
+        """Name of the scene's frame: that of the track, else of the first image, sector or view."""
+        if self.name is not None:
+            return self.book.frame(self.name)
+        for name in ("image", "sector", *VIEW_STREAMS):
+            for _, message, _ in checked_messages(self._reader, STREAMS[name].info_topic, lambda _: None):
+                with contextlib.suppress(CsasError):  # named where they are read
+                    return frame_of(message, name)
+        return SCENE_FRAME
+
+    def origin(self, report: Callable[[Problem], None]) -> tuple[Origin, bytes] | None:
+        """Return what topic origin says of the place of this run's frame, and the message as recorded."""
+        said: list[tuple[Origin, bytes]] = []
+        for message, decoded, stamp in checked_messages(self._reader, "origin", report, repeated=True):
+            try:
+                said.append((origin_from_msg(decoded), bytes(message.cdr)))
+            except CsasError as error:
+                report(Problem(message.topic, message.number, stamp, str(error)))
+        last_ns = None if self.name is None else self.book.span(self.name)[1]
+        chosen = origin_of((origin for origin, _ in said), self.frame, last_ns)
+        if said and chosen is None:
+            other, topic = said[-1][0], absolute_name("origin", self._reader.namespace)
+            reason = f"origin.header.frame_id is {quoted(other.frame)}; expected the run's, {self.frame!r}"
+            report(Problem(topic, None, other.stamp_ns, f"{reason}: it gives no place"))
+        return next((one for one in said if one[0] is chosen), None)
 
     def doubt(self, stamp_ns: int) -> str | None:
         """Say that several tracks cover a stamp; None if not."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeVar, get_args
 
 from .errors import ParameterError
+from .geometry.place import Datum
 
 T = TypeVar("T")
 
@@ -39,12 +40,15 @@ def bounded(
     choices: tuple[str, ...] = (),
     unit: str = "",
     length: int | None = None,
+    optional: bool = False,
 ) -> Any:
     """Declare a dataclass field with its bounds, unit and one line of description.
 
-    A float, int, bool, str or tuple of floats (`length` long, each inside the bounds).
+    A float, int, bool, str or tuple of floats (`length` long, each inside the bounds). An optional one is a
+    float that may be NaN: not given.
     """
     meta = {"doc": doc, "low": low, "high": high, "choices": choices, "unit": unit, "length": length}
+    meta["optional"] = optional
     return dataclasses.field(default=default, metadata=meta)
 
 
@@ -57,6 +61,8 @@ def _check_number(name: str, value: Any, field: dataclasses.Field[Any]) -> float
     if kind is int and math.isfinite(value) and float(value) != int(value):
         raise ParameterError(f"{name} is {value!r}; expected a whole number")
     low, high = meta["low"], meta["high"]
+    if meta["optional"] and math.isnan(value):
+        return math.nan
     if not math.isfinite(value) or (low is not None and value < low) or (high is not None and value > high):
         raise ParameterError(f"{name} is {value}{unit}; expected a number in [{low:g}, {high:g}]{unit}")
     return kind(value)
@@ -238,12 +244,71 @@ VIEW_STAGES: tuple[Stage, ...] = get_args(Stage)
 #: What a run can start from; auto takes the first that the bag holds.
 START_FROM: tuple[StartFrom, ...] = get_args(StartFrom)
 
+
+@dataclass(frozen=True)
+class PlaceParameters(Parameters):
+    """Where on earth the scene is: a datum, instead of topic origin."""
+
+    origin_lat_deg: float = bounded(
+        math.nan, "latitude of the scene's origin, WGS-84", low=-90.0, high=90.0, unit="deg", optional=True
+    )
+    origin_lon_deg: float = bounded(
+        math.nan, "longitude of the scene's origin", low=-180.0, high=360.0, unit="deg", optional=True
+    )
+    origin_heading_deg: float = bounded(
+        math.nan,
+        "true bearing of the scene's y axis, clockwise; none: north",
+        low=-360.0,
+        high=360.0,
+        unit="deg",
+        optional=True,
+    )
+    origin_sigma_m: float = bounded(
+        math.nan,
+        "standard deviation of that origin, along east and north",
+        low=0.0,
+        high=1e5,
+        unit="m",
+        optional=True,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if math.isnan(self.origin_lat_deg) != math.isnan(self.origin_lon_deg):
+            given, lacking = ("lat", "lon") if math.isnan(self.origin_lon_deg) else ("lon", "lat")
+            raise ParameterError(f"origin_{given}_deg is given, origin_{lacking}_deg is not; expected both")
+
+    @property
+    def given(self) -> bool:
+        """Whether they say where the origin is, so that nobody else is asked."""
+        return not math.isnan(self.origin_lat_deg)
+
+    def datum(self, said: Datum | None = None) -> Datum | None:
+        """Return the datum of a run.
+
+        Parameters
+        ----------
+        said : Datum, optional
+            What topic origin says. Latitude and longitude that are given come before it; a heading that is
+            given turns it.
+        """
+        if self.given:
+            heading = 0.0 if math.isnan(self.origin_heading_deg) else self.origin_heading_deg
+            variance = self.origin_sigma_m**2
+            covariance = None if math.isnan(variance) else (variance, variance, 0.0)
+            return Datum(self.origin_lat_deg, self.origin_lon_deg, heading, covariance_m2=covariance)
+        if said is None or math.isnan(self.origin_heading_deg):
+            return said
+        return dataclasses.replace(said, heading_deg=self.origin_heading_deg)
+
+
 STAGES: dict[str, type[Parameters]] = {
     "sub_aperture": SubApertureParameters,
     "shadow": ShadowParameters,
     "likelihood": LikelihoodParameters,
     "carving": CarvingParameters,
     "target": TargetParameters,
+    "place": PlaceParameters,
 }
 
 
@@ -256,3 +321,4 @@ class PipelineParameters:
     likelihood: LikelihoodParameters = dataclasses.field(default_factory=LikelihoodParameters)
     carving: CarvingParameters = dataclasses.field(default_factory=CarvingParameters)
     target: TargetParameters = dataclasses.field(default_factory=TargetParameters)
+    place: PlaceParameters = dataclasses.field(default_factory=PlaceParameters)

@@ -44,6 +44,8 @@ class ProcessedView:
 
     def __init__(self, target: Target | None, p: PipelineParameters, **given: View) -> None:
         self.target, self.p = target, p
+        #: Of the first view that is there.
+        self.info = next((view.info for view in given.values()), None)
         self.sub_aperture = given.pop("sub_aperture", None)
         # A stage that is given is never made.
         self.__dict__.update({stage.removeprefix("shadow_"): view for stage, view in given.items()})

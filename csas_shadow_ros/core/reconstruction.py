@@ -22,7 +22,7 @@ from .arcs import Arc, Arcs
 from .carving import Carver
 from .composites import Composites
 from .errors import ViewError
-from .geometry import View, ViewInfo
+from .geometry import SCENE_FRAME, View, ViewInfo
 from .hollows import EchoLook, matter_mesh, matter_of
 from .likelihood import Levels
 from .masks import MASK_SHADOW, KeptMask
@@ -217,6 +217,8 @@ class Reconstruction:
         self.rejected: dict[float, str] = {}
         self.composites: Composites | None = None
         self.timings_s: dict[str, float] = {}
+        #: Frame of the run; None before the first view, where no decision says it.
+        self.frame = decision.frame
         #: How many views there will be at most; 0: nobody knows.
         self.most_views = 0
         self._compose = compose
@@ -238,9 +240,11 @@ class Reconstruction:
         Raises
         ------
         ViewError
-            If the body's grid cannot take it.
+            If the body's grid cannot take it, or it is in another frame than the run.
         """
         own = self.bodies[body]
+        if view.info is not None:
+            self._require_frame(view.info)
         if own.given_up:
             return False
         fresh = own.add(view, parts)
@@ -252,6 +256,15 @@ class Reconstruction:
             half = pixels.info.aperture_rad / 2.0
             self.arcs.add(Arc(pixels.info.aspect_rad - half, 2.0 * half))
         return fresh
+
+    def _require_frame(self, info: ViewInfo) -> None:
+        if self.frame is None:
+            self.frame = info.frame
+        if info.frame != self.frame:
+            raise ViewError(
+                f"view stamped {info.stamp_ns} ns is in frame {info.frame!r}; expected that of the run,"
+                f" {self.frame!r}"
+            )
 
     def settle(self, decision: Decision) -> None:
         """Take the whole run's decision for a provisional one that carves the same volumes."""
@@ -387,6 +400,7 @@ class Reconstruction:
             left_out=list(self.decision.left_out),
             timings_s=dict(self.timings_s),
             best_shadow=self._best[1],
+            frame=self.frame or SCENE_FRAME,
         )
         if self.stamps:
             body = self.bodies[0]

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import GeometryError
-from .geometry import Acoustics, CoherentImage, GroundGrid
+from .geometry import SCENE_FRAME, Acoustics, CoherentImage, GroundGrid
 
 
 class HasBand(Protocol):
@@ -21,6 +21,8 @@ class HasBand(Protocol):
     def grid(self) -> GroundGrid: ...
     @property
     def acoustics(self) -> Acoustics: ...
+    @property
+    def frame(self) -> str: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,8 @@ class Sector:
         Centre and full width of the arc.
     carrier_rad_m : (float, float)
         Wavenumber (kx, ky), scene axes, that was divided out.
+    frame : str
+        Name of the scene frame that it is in: one for all of a run.
     """
 
     pixels: NDArray[Any]
@@ -50,6 +54,7 @@ class Sector:
     aspect_rad: float
     aperture_rad: float
     carrier_rad_m: tuple[float, float] = (0.0, 0.0)
+    frame: str = field(default=SCENE_FRAME, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.pixels.shape != self.grid.shape:
@@ -93,7 +98,9 @@ def same_band(a: Acoustics, b: Acoustics) -> bool:
 
 
 def unlike(own: HasBand, expected: HasBand) -> tuple[str, str] | None:
-    """Say in what a sector differs, ``grid`` or ``band``, with both values; None if in neither."""
+    """Say in what a sector differs, ``frame``, ``grid`` or ``band``, with both values; None if in none."""
+    if own.frame != expected.frame:
+        return "frame", f"{own.frame!r}; expected {expected.frame!r}"
     if not same_grid(own.grid, expected.grid):
         return "grid", f"{own.grid}; expected {expected.grid}"
     if not same_band(own.acoustics, expected.acoustics):

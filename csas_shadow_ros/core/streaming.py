@@ -131,7 +131,7 @@ class SectorSum:
         """Take a full-circle image as the one sector that covers the circle."""
         total = cls(workers)
         blank = np.broadcast_to(np.complex64(0), image.grid.shape)
-        whole = Sector(blank, image.grid, image.acoustics, image.stamp_ns, 0.0, TWO_PI)
+        whole = Sector(blank, image.grid, image.acoustics, image.stamp_ns, 0.0, TWO_PI, frame=image.frame)
         total._first, total._spectrum = whole, Spectrum.of_image(image, workers)
         total.stamps.add(image.stamp_ns)
         total.arcs.add(Arc(0.0, TWO_PI))
@@ -160,17 +160,16 @@ class SectorSum:
         """The image's lattice and band, with pixels that take no memory and hold nothing."""
         if self._first is None:
             raise GeometryError("there are no sectors to sum; expected at least one")
-        blank = np.broadcast_to(np.complex64(0), self._first.grid.shape)
-        return CoherentImage(blank, self._first.grid, self._first.acoustics, self.newest_ns)
+        first = self._first
+        blank = np.broadcast_to(np.complex64(0), first.grid.shape)
+        return CoherentImage(blank, first.grid, first.acoustics, self.newest_ns, frame=first.frame)
 
     def image(self) -> CoherentImage:
         """Transform the sum back to the coherent image, stamped with the last sector's stamp."""
         frame = self.frame
         pixels = scipy.fft.ifft2(self.spectrum.values, norm="forward", workers=self._workers)
         rows, cols = frame.grid.shape
-        return CoherentImage(
-            np.ascontiguousarray(pixels[:rows, :cols]), frame.grid, frame.acoustics, frame.stamp_ns
-        )
+        return replace(frame, pixels=np.ascontiguousarray(pixels[:rows, :cols]))
 
     def add(self, sector: Sector) -> Arc | None:
         """Add a sector.
@@ -282,7 +281,8 @@ def part_of_track(track: Track, arcs: Arcs) -> Track | None:
     inside = arcs.contains(track.aspects_rad)
     if int(inside.sum()) < 3:
         return None
-    return Track(track.stamps_ns[inside], track.positions_m[inside], max_gap_rad=track.max_gap_rad)
+    stamps, positions = track.stamps_ns[inside], track.positions_m[inside]
+    return Track(stamps, positions, max_gap_rad=track.max_gap_rad, frame=track.frame)
 
 
 def same_track(a: Track, b: Track) -> bool:

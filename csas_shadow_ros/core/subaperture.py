@@ -31,6 +31,7 @@ from .geometry import (
     View,
     ViewInfo,
     aspects_of_step,
+    one_frame,
     view_ground_to_pixel,
 )
 from .kernels import kernel
@@ -383,8 +384,10 @@ class SubApertures:
         spectrum: Spectrum | None = None,
     ) -> None:
         p = parameters or SubApertureParameters()
+        one_frame("the track", track.frame, image.frame, "the image")
         self.parameters = p
         self.track = track
+        self.frame = image.frame
         self.grid = image.grid
         self.acoustics = image.acoustics
         self.aperture_rad = math.radians(p.aperture_deg)
@@ -441,7 +444,9 @@ class SubApertures:
         camera = ShadowCamera.from_ground(to_pixel, sonar, self.size, self.size)
         centre, steps = self._carrier_bin(aspect_rad), self.spectrum.step_rad_m
         carrier = (centre[1] * steps[1], -centre[0] * steps[0])
-        return ViewInfo(stamp, camera, self.acoustics, aspect_rad, self.aperture_rad, carrier)
+        return ViewInfo(
+            stamp, camera, self.acoustics, aspect_rad, self.aperture_rad, carrier, frame=self.frame
+        )
 
     def _carrier_bin(self, aspect_rad: float) -> tuple[int, int]:
         """(row, col) bin of the spectrum, signed, nearest to the wedge's middle."""

@@ -45,6 +45,7 @@ class BagPlayerNode(CsasNode):
             self.source.flow.offer(self.views.times)
             self.latch("target")
         self.latch_track()
+        self.latch_origin()
         for line in (*self.reader.problems, *(self.views.problems if self.views else ())):
             self.reject(line)
 
@@ -85,6 +86,12 @@ class BagPlayerNode(CsasNode):
         if name is not None:
             path = track_to_msg(self.messages, self.runs.book.track(name))
             self.publisher("track", qos.LATCHED).publish(path)
+
+    def latch_origin(self) -> None:
+        """Publish what the bag says of the run's place on earth, as it was recorded."""
+        said = self.runs.origin(self._problem)
+        if said is not None:
+            self.latch("origin", said[1])
 
     def _problem(self, problem: Problem) -> None:
         self.reject(str(problem))

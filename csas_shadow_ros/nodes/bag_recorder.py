@@ -29,6 +29,10 @@ from .runtime.runs import HOLD_S
 #: Topics of messages that differ though they carry the same stamp.
 _NEVER_ALIKE = frozenset({"progress", "/diagnostics"})
 #: A run's result stays published until the next one has these to say; then its bag is finished.
+#: What is said once for all runs to come, whenever: each bag has it, as far as it is known.
+_STANDING = frozenset({"origin", "scene_transform"})
+#: So many of them are kept: a mission says it anew for each contact.
+_MOST_STANDING = 16
 _ENDS_THE_RUN_BEFORE = frozenset({"measurements", "voxel_grid/image"})
 #: Bags of one recorder, at most.
 _MOST_RUNS = 10_000
@@ -120,6 +124,7 @@ class BagRecorderNode(CsasNode):
         self._over: set[int] = set()
         #: Images and sectors whose stamp no track covers yet: (since, topic, message).
         self._unplaced: list[tuple[float, str, bytes]] = []
+        self._standing: deque[tuple[str, int, bytes]] = deque(maxlen=_MOST_STANDING)
         self._flushed_s = 0.0
         #: Topics of which something was not taken for want of space, and the latched topics' subscriptions.
         self._dropped: set[str] = set()
@@ -235,6 +240,11 @@ class BagRecorderNode(CsasNode):
             self._dropped.add(topic)
             return
         newest = self._bags[-1]
+        if topic in _STANDING:
+            self._standing.append((topic, when, cdr))
+            for bag in self._bags:
+                self._write(bag, topic, cdr, when)
+            return
         if topic == "track":
             name = self._learn(cdr)
             if newest.run_ns is None:
@@ -313,6 +323,8 @@ class BagRecorderNode(CsasNode):
             self._close_bag(self._bags[0])
         for when, cdr in self._tracks.pop(run_ns, ()):
             self._write(bag, "track", cdr, when)
+        for topic, when, cdr in self._standing:
+            self._write(bag, topic, cdr, when)
         return bag
 
     def _record(self, topic: str) -> None:

@@ -46,6 +46,7 @@ from msg_adapters import (
     ViewProgress,
     decision_from_msg,
     diagnostics_to_msg,
+    frame_of,
     is_routine_report,
     message_from_cdr,
     progress_from_msg,
@@ -205,7 +206,11 @@ class CsasNode(LifecycleNode):
 
     def publisher(self, topic: str, profile: Any) -> Publisher:
         """Make a publisher of a topic of the contract."""
-        made = self.create_publisher(self.messages.cls(topic_of(topic).type_name), topic, profile)
+        return self.own_publisher(self.messages.cls(topic_of(topic).type_name), topic, profile)
+
+    def own_publisher(self, kind: Any, topic: str, profile: Any) -> Publisher:
+        """Make a publisher of a type and topic that are not of the contract."""
+        made = self.create_publisher(kind, topic, profile)
         self._owned.append((self.destroy_publisher, made))
         return made
 
@@ -311,6 +316,11 @@ class CsasNode(LifecycleNode):
 
         if self.executor is not None:
             self.executor.create_task(again)  # not within a timer that it takes away
+
+    @property
+    def scene_frame(self) -> str:
+        """The one frame that messages may be in; empty: any, as long as a run has one."""
+        return str(self.parameters.scene_frame)
 
     @property
     def trouble(self) -> str:
@@ -804,6 +814,8 @@ class Inlet:
 
     def _take(self, msg: Any, *, is_info: bool) -> None:
         self._last_s = time.monotonic()
+        kind = stream_of(self.stream)
+        frame_of(msg, kind.info_topic if is_info else kind.image_topic, self.node.scene_frame)
         pair = self._pairer.add(msg, is_info=is_info)
         self._report_orphans()
         if pair is None:
@@ -1137,7 +1149,8 @@ class TargetInlet:
             if self._node.count_publishers("search"):
                 self._early = msg  # what else there is to carve comes at the same time
                 return
-        decision = Decision(self._target_of(box)) if searched is None else searched.decision
+        frame = None if box is None else frame_of(msg, "target", self._node.scene_frame)
+        decision = Decision(self._target_of(box), frame=frame) if searched is None else searched.decision
         run_ns = None if searched is None else searched.run_ns
         if str(stamp) == self._node.target_stamp:
             if not decision.same_target(self.decision):

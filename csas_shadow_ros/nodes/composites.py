@@ -54,6 +54,7 @@ class CompositesNode(CsasNode):
         self.run_ns: int | None = None
         self.composites: Composites | None = None
         self.acoustics: Acoustics | None = None
+        self.frame = ""
 
     def keeps_its_state(self) -> bool:
         """Say no: views of another graph may be in the images."""
@@ -83,6 +84,12 @@ class CompositesNode(CsasNode):
             self.run_ns = run_ns
         if self.composites is None:
             self.composites, self.acoustics = Composites.for_view(view), view.info.acoustics
+            self.frame = view.info.frame
+        if view.info.frame != self.frame:
+            raise ViewError(
+                f"view stamped {view.info.stamp_ns} ns is in frame {view.info.frame!r}; expected that of the"
+                f" run, {self.frame!r}"
+            )
         if self.composites.integrate(view):
             self.growing.changed()
         return INTEGRATED
@@ -114,7 +121,8 @@ class CompositesNode(CsasNode):
         """Publish both images as they are."""
         if self.composites is None or self.acoustics is None:
             return
-        ground = GroundInfo(max(self.composites.stamps), self.composites.grid, self.acoustics)
+        newest_ns = max(self.composites.stamps)
+        ground = GroundInfo(newest_ns, self.composites.grid, self.acoustics, frame=self.frame)
         pixels: dict[str, NDArray[Any]] = {
             "multilook": self.composites.multilook(),
             "color_by_aspect": self.composites.color_by_aspect(self.parameters.dynamic_range_db),

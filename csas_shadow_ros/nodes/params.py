@@ -8,6 +8,7 @@ with ``--yaml`` the YAML file.
 from __future__ import annotations
 
 import dataclasses
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from csas_shadow_ros.core.parameters import (
     CarvingParameters,
     LikelihoodParameters,
     Parameters,
+    PlaceParameters,
     ShadowParameters,
     SubApertureParameters,
     TargetParameters,
@@ -34,6 +36,7 @@ class NodeParameters(Parameters):
     """What every node takes."""
 
     autostart: bool = bounded(True, "configure and activate at once; false: wait for a lifecycle manager")
+    scene_frame: str = bounded("", "frame that all messages of a run must be in; empty: any one")
 
 
 @dataclass(frozen=True)
@@ -122,12 +125,32 @@ class VoxelCarverNodeParameters(
     ShadowParameters,
     LikelihoodParameters,
     CarvingParameters,
+    PlaceParameters,
 ):
     """Parameters of `voxel_carver`; those of earlier stages measure the target and make further bodies."""
 
+    parent_frame: str = bounded(
+        "earth", "frame that scene_transform leads to: earth (REP 105), or an east-north-up one, such as map"
+    )
+    parent_lat_deg: float = bounded(
+        math.nan,
+        "latitude of that frame's origin; none: the scene's",
+        low=-90.0,
+        high=90.0,
+        unit="deg",
+        optional=True,
+    )
+    parent_lon_deg: float = bounded(
+        math.nan, "its longitude", low=-180.0, high=360.0, unit="deg", optional=True
+    )
     compare: bool = bounded(
         True, "carve by the other method too, on other_method/*; it finds what is too thin for silhouettes"
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if math.isnan(self.parent_lat_deg) != math.isnan(self.parent_lon_deg):
+            raise ParameterError("of parent_lat_deg and parent_lon_deg one is given; expected both or none")
 
 
 @dataclass(frozen=True)
@@ -232,7 +255,8 @@ def expected_of(field: dataclasses.Field[Any]) -> str:
     if meta["low"] is None:
         return "text"
     each = " each" if meta["length"] else ""
-    return f"{meta['low']:g} to {meta['high']:g}{each}"
+    none = "; nan: none" if meta["optional"] else ""
+    return f"{meta['low']:g} to {meta['high']:g}{each}{none}"
 
 
 def description_of(field: dataclasses.Field[Any]) -> str:
@@ -261,7 +285,9 @@ def declare(node: Any, parameters: Parameters) -> None:
             additional_constraints=expected_of(field),
             read_only=field.name not in DYNAMIC,
         )
-        if isinstance(field.default, float):
+        if meta["optional"]:
+            pass  # rclpy finds that NaN is out of any range; `_on_set_parameters` checks it
+        elif isinstance(field.default, float):
             descriptor.floating_point_range = [
                 FloatingPointRange(from_value=float(meta["low"]), to_value=float(meta["high"]), step=0.0)
             ]
@@ -284,6 +310,8 @@ def _yaml_value(value: Any) -> str:
         return f"[{', '.join(_yaml_value(v) for v in value)}]"
     if isinstance(value, float):
         # rcl reads a number without a point as an integer, and YAML 1.1 reads 1e-05 as a text.
+        if math.isnan(value):
+            return ".nan"
         text = repr(value)
         return text if "." in text else text.replace("e", ".0e")
     return str(value)

@@ -44,12 +44,14 @@ class ShadowEnhancementNode(CsasNode):
         view = view_from_msgs(image, info, "sub_aperture")
         if self.target.target is None:
             raise NoTargetError("no target: topic target says that there is no object in the scene")
+        self.target.decision.require_frame(view.info)
         made = ProcessedView(self.target.target, self.pipeline, sub_aperture=view)
         shadow = made.require("shadow")
         self.shadow.send(shadow)
         if self.display.get_subscription_count():
             picture = decibel_picture(shadow.pixels)
-            self.display.publish(display_to_msg(self.messages, picture, shadow.info.stamp_ns))
+            messages = self.messages.in_frame(shadow.info.frame)
+            self.display.publish(display_to_msg(messages, picture, shadow.info.stamp_ns))
         return PUBLISHED
 
 

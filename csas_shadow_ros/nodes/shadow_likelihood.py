@@ -54,6 +54,7 @@ class ShadowLikelihoodNode(CsasNode):
     def work(self, image: Any, info: Any) -> str:
         """Make the likelihood, and the mask, of one view."""
         view = view_from_msgs(image, info, "shadow")
+        self.target.decision.require_frame(view.info)
         made = ProcessedView(self.target.target, self.pipeline, shadow=view)
         made.require("levels")  # a view without levels is refused, whoever takes what is made of it
         # The mask goes first: once the likelihood is in the grid the view may count as done.

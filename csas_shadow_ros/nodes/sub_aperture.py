@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from csas_shadow_ros.bags.check import ERROR, judge_band, judge_coverage, judge_geometry, judge_image
@@ -30,6 +30,7 @@ from msg_adapters import (
     coherent_image_from_msgs,
     data_stamp_to_ns,
     decision_to_msg,
+    frame_of,
     message_from_cdr,
     sector_from_msgs,
     stamp_to_ns,
@@ -187,6 +188,7 @@ class SubApertureNode(CsasNode):
         pair = self.pairer.add(msg, is_info=is_info)
         # A latched topic comes twice, by both subscriptions: its orphans are no news.
         self.pairer.orphans.clear()
+        frame_of(msg, "camera_info" if is_info else "image", self.parameters.scene_frame)
         if pair is not None:
             self.place_image(*pair, time.monotonic())
 
@@ -465,7 +467,8 @@ class SubApertureNode(CsasNode):
 
     def publish_decision(self, decision: Decision, run: Run, *, may_move: bool) -> None:
         """Publish what is carved, and the target's volume for whoever knows that topic alone."""
-        stamp = run.target_sent
+        stamp, frame = run.target_sent, run.stream.sum.frame.frame
+        decision = replace(decision, frame=frame)
         # First, so that whoever takes the target knows what else there is.
         self.search.publish(
             decision_to_msg(self.messages, decision, stamp, run.name, stamp, may_move=may_move)
@@ -474,7 +477,8 @@ class SubApertureNode(CsasNode):
         if target is not None:
             x, y = target.position_m
             box = TargetBox((x, y, target.size_m[2] / 2.0), target.size_m)
-        self.target.publish(target_to_msg(self.messages, box, stamp, may_move=may_move))
+        messages = self.messages.in_frame(frame)
+        self.target.publish(target_to_msg(messages, box, stamp, may_move=may_move))
 
     # Views
 

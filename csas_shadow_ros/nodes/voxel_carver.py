@@ -30,6 +30,7 @@ from . import qos
 from .base import INTEGRATED, CsasNode, Inlet, TargetInlet, run_node
 from .growing import Growing
 from .params import part
+from .runtime.place import PlaceOnEarth
 from .runtime.runs import RunFollower
 
 #: What of a view each stream brings for the target.
@@ -66,6 +67,7 @@ class VoxelCarverNode(CsasNode):
         self.growing = Growing(self.publish_result, self.wanted, p.publish_hz)
         self.runs = RunFollower(self, lambda *_: self.release())
         self.target = TargetInlet(self, self.on_target, self.begin_again)
+        self.place = PlaceOnEarth(self, self.on_place)
         self.stream = "shadow_mask" if p.takes_masks else "likelihood"
         self.inlet = self.inlet_of(self.stream)
         # Without silhouettes the soft method has nothing to measure on.
@@ -127,7 +129,15 @@ class VoxelCarverNode(CsasNode):
         elif not wanted and self.further is not None:
             self.further.close()
             self.further = None
+        if self.target.decision.frame is not None:
+            run_ns = self.target.run_ns
+            self.place.publish(self.target.decision.frame, run_ns, self.runs.last_of(run_ns))
         self.release()
+
+    def on_place(self) -> None:
+        """Publish the result again if it may be elsewhere."""
+        if self.result is not None:
+            self.growing.changed()
 
     def begin_again(self, *, another_run: bool) -> None:
         """Drop what was made of a target that has moved; of a run that is over, publish the end first."""
@@ -262,6 +272,7 @@ class VoxelCarverNode(CsasNode):
             run_ns = self.target.run_ns
             made = Reconstruction(self.target.decision, self.pipeline, compose=False, run_ns=run_ns)
         result = self.result = made.result(final=final)
+        result.datum = self.place.publish(result.frame, result.run_ns, self.runs.last_of(result.run_ns))
         stamp = result.stamp_ns or self.now_ns()
 
         def looked_at(name: str) -> bool:

@@ -11,6 +11,7 @@ from mcap.exceptions import McapError
 
 from msg_adapters.camera_info import GroundInfo
 from msg_adapters.messages import RosbagsMessages
+from msg_adapters.origin import origin_to_msg, scene_transform_to_msg
 from msg_adapters.pairs import (
     coherent_image_to_msgs,
     ground_picture_to_msgs,
@@ -24,7 +25,7 @@ from msg_adapters.track import track_to_msg
 
 from ..bags import BagReader, BagWriter
 from ..core.errors import CsasError
-from ..core.geometry import Acoustics, CoherentImage, Track, View
+from ..core.geometry import Acoustics, CoherentImage, Origin, Track, View
 from ..core.shape.result import Result
 
 #: Topics that a result's bag always has, whatever the run found.
@@ -144,7 +145,7 @@ class ResultBag:
     def _write_result(self, result: Result) -> None:
         factory, when = self._factory, self._last_ns
         if result.composites is not None and result.composites.stamps and self._acoustics is not None:
-            info = GroundInfo(when, result.composites.grid, self._acoustics)
+            info = GroundInfo(when, result.composites.grid, self._acoustics, frame=result.frame)
             pictures = (
                 ("multilook", result.composites.multilook()),
                 ("color_by_aspect", result.composites.color_by_aspect()),
@@ -153,8 +154,17 @@ class ResultBag:
                 picture, camera = ground_picture_to_msgs(factory, pixels, info, name)
                 self._write(STREAMS[name].info_topic, camera)
                 self._write(STREAMS[name].image_topic, picture)
+        factory = factory.in_frame(result.frame)
         if result.decision is not None:
             self._write("search", decision_to_msg(factory, result.decision, when, result.run_ns, when))
+        if result.datum is not None:
+            origin = Origin(when, result.frame, result.datum)
+            for name, message in (
+                ("origin", origin_to_msg(factory, origin)),
+                ("scene_transform", scene_transform_to_msg(factory, origin)),
+            ):
+                self._writer.add_topic(absolute_name(name), TOPICS[name].type_name, depth=1)
+                self._write(name, message, when)
         box = None
         if result.target is not None:
             x, y = result.target.position_m

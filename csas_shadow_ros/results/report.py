@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..core.geometry import CoherentImage, Track
+from ..core.geometry import CoherentImage, Place, Track
 from ..core.mesh import Dimensions
 from ..core.parameters import CarvingParameters, PipelineParameters
 from ..core.shape.result import Result, ViewEvidence
@@ -180,6 +180,7 @@ def _objects(result: Result) -> list[dict[str, Any]]:
                 "number": number,
                 "position_m": one.dimensions.position_m,
                 "dimensions": _dimensions(one.dimensions),
+                "place": result.place_of(one.dimensions),
                 "target": one.target,
                 "grid": _grid(one.grid),
                 "views_used": one.views_used,
@@ -335,6 +336,8 @@ def build_report(
         "why_no_object": part("why_no_object", lambda: None if result.objects else no_object_reason(result)),
         "run": result.run_ns,
         "arc_deg": math.degrees(result.arc_rad),
+        "frame": result.frame,
+        "datum": result.datum,
         "objects": part("objects", lambda: _objects(result), []),
         "objects_left_out": result.left_out,
         "method": context.parameters.carving.method,
@@ -493,6 +496,12 @@ def summary(report: Mapping[str, Any]) -> str:
                 line += f"{off:>+{12 - len(unit) - 1}.{digits}f} {unit}"
             lines.append(line)
         lines.append("")
+    # Reports of before these entries have none.
+    for entry in report.get("objects", []):
+        if entry.get("place"):
+            place = Place(**{k: math.nan if v is None else v for k, v in entry["place"].items()})
+            name = f"object {entry['number']}" if len(report["objects"]) > 1 else "place"
+            lines.append(f"{name}: {place}, true bearing of its length {place.bearing_deg:.1f}°")
     if truth.get("scores"):
         s = truth["scores"]
         lines.append(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import check_type
+from ..core.geometry import Datum
 from ..core.sector import Sector
 from .run import SimulatedRun, simulate
 from .sectors import sectors_of_run
@@ -19,6 +20,7 @@ def simulate_bag(
     encoding: str = "32FC2",
     overwrite: bool = False,
     sectors_deg: float = 0.0,
+    datum: Datum | None = None,
     **kwargs: Any,
 ) -> SimulatedRun:
     """Simulate a run, write it as a complete bag, and write ``<path>.truth.stl`` and ``.json`` beside it.
@@ -35,6 +37,8 @@ def simulate_bag(
         Replace a bag that is there.
     sectors_deg : float
         Write the image as sectors of so much arc, as they would come during the run; 0: as it is.
+    datum : Datum, optional
+        Where on earth the scene's origin is, for topic ``origin``.
 
     Returns
     -------
@@ -59,7 +63,7 @@ def simulate_bag(
     from ..bags import write_run
 
     run = simulate(*args, **kwargs)
-    how: dict[str, Any] = {"encoding": encoding, "overwrite": overwrite}
+    how: dict[str, Any] = {"encoding": encoding, "overwrite": overwrite, "datum": datum}
     if sectors_deg:
         times: dict[int, int] = {}
 

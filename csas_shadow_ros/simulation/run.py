@@ -40,7 +40,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from ..core.errors import ParameterError, check_range
-from ..core.geometry import TWO_PI, Acoustics, CoherentImage, Track
+from ..core.geometry import SCENE_FRAME, TWO_PI, Acoustics, CoherentImage, Track
 from ..core.solid import apart
 from ..progress import ProgressOption, progress_bar
 from .profiles import Faults, Profile, get_profile
@@ -436,6 +436,7 @@ def simulate(
     bed: Seabed | None = None,
     clockwise: bool = False,
     start_aspect_deg: float = 0.0,
+    frame: str = SCENE_FRAME,
     workers: int | None = None,
     progress: ProgressOption = None,
 ) -> SimulatedRun:
@@ -465,6 +466,8 @@ def simulate(
         Which way the sonar goes round.
     start_aspect_deg : float
         Aspect of the first pose.
+    frame : str
+        Name of the scene's frame.
     workers : int, optional
         Threads; all processors by default. Does not change the result.
     progress : callable or bool, optional
@@ -567,7 +570,8 @@ def simulate(
         profile.sound_speed_mps * (1.0 + faults.sound_speed_error),
         -spectrum_sign if faults.wrong_sign else spectrum_sign,
     )
-    image = CoherentImage(np.ascontiguousarray(pixels), profile.grid, claimed, int(stamps[-1]))
+    made = np.ascontiguousarray(pixels)
+    image = CoherentImage(made, profile.grid, claimed, int(stamps[-1]), frame=frame)
     truth = Truth(
         name=scene.name,
         target=scene.target,
@@ -581,7 +585,7 @@ def simulate(
         acoustics=true_acoustics,
         sonar_m=orbit.over_seabed(positions),
     )
-    return SimulatedRun(image, Track(stamps, reported), truth)
+    return SimulatedRun(image, Track(stamps, reported, frame=frame), truth)
 
 
 def _poses(

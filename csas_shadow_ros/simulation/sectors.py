@@ -68,8 +68,9 @@ def sectors_of_run(image: CoherentImage, track: Track, width_deg: float) -> Iter
         # The transform is referred to the image's corner, the contract's carrier to the scene's origin.
         corner = carrier[0] * image.grid.x_min_m + carrier[1] * image.grid.y_max_m
         pixels *= np.complex64(np.exp(-1j * corner))
+        at = float(np.mod(aspect, TWO_PI))
         sector = Sector(
-            pixels, image.grid, image.acoustics, stamp, float(np.mod(aspect, TWO_PI)), width, carrier
+            pixels, image.grid, image.acoustics, stamp, at, width, carrier, frame=image.frame
         )
         yield sector, _passed(track, aspect + turns * width / 2.0, stamp, width)
 

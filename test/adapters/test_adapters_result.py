@@ -492,7 +492,7 @@ def frame(name):
         (drop("object 1", "height_m.low"), r"status 'object 1': height_m\.low is missing"),
         (drop("other method", "method"), r"status 'other method': method is missing"),
         (drop("left out 1", "y_m"), r"status 'left out 1': y_m is missing"),
-        (frame("map"), r"measurements\.header\.frame_id is 'map'; expected 'csas_scene'"),
+        (frame(""), r"measurements\.header\.frame_id is ''; expected the name of the scene's frame"),
     ],
 )
 def test_malformed_measurements_are_refused_by_status_and_value(factory, spoil, match):
@@ -572,7 +572,7 @@ def cube(**changes):
             lambda m: setattr(m.markers[0].pose.position, "x", math.nan),
             r"position is .*; expected finite metres",
         ),
-        (lambda m: frame("map")(m.markers[0]), r"markers\[0\]\.header\.frame_id is 'map'"),
+        (lambda m: frame("")(m.markers[0]), r"markers\[0\]\.header\.frame_id is ''"),
     ],
 )
 def test_malformed_objects_are_refused_by_field(factory, spoil, match):

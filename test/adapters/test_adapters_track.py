@@ -36,12 +36,13 @@ def assert_the_same(a, b):
     assert (a.header_ns, a.notes) == (b.header_ns, b.notes)
 
 
-@pytest.mark.parametrize("frame", ["csas_scene", ""])
+@pytest.mark.parametrize("frame", ["csas_scene", "auv_1/scene", ""])
 @pytest.mark.parametrize("poses", [1, 2, 180])
 @pytest.mark.parametrize("little_endian", [True, False])
 def test_a_serialised_path_reads_the_same_as_its_poses_one_by_one(track, frame, poses, little_endian):
     path = track_to_msg(FACTORY, track)
     path.poses = path.poses[:poses]
+    path.header = replace(path.header, frame_id=frame or "csas_scene")
     for one in path.poses:
         one.header = replace(one.header, frame_id=frame)
     packed = message_from_cdr(serialised(path, little_endian=little_endian), PATH, "track")

@@ -186,7 +186,7 @@ def spoil_depth(a, b, c):
         (spoil_sign, "/csas/image", "spectrum_sign, is 0; expected +1 or -1", "publisher"),
         (spoil_stamp, "/csas/image", "has no camera_info of the same stamp", "the very same header.stamp"),
         (spoil_size, "/csas/image", "camera_info.width is 129; expected", "publisher"),
-        (spoil_frame, "/csas/track", "frame_id is 'map'; expected 'csas_scene'", "publisher of /csas/track"),
+        (spoil_frame, "/csas/track", "poses[0].header.frame_id is 'csas_scene'; expected 'map'", "publisher"),
         (spoil_order, "/csas/track", "out of order: pose 0 ", "publisher of /csas/track"),
         (spoil_depth, "/csas/track", "pose 0 is at z = -18 m", "publisher of /csas/track"),
     ],

@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("rclpy")
 
 from csas_shadow_ros.bags import BagReader
+from csas_shadow_ros.core.geometry import Datum
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
 from csas_shadow_ros.process import process_bag, replay_bag
 from csas_shadow_ros.simulation.bag import simulate_bag
@@ -40,6 +41,9 @@ SCENES = {
 }
 
 
+DATUM = Datum(48.3829, -4.4953, altitude_m=-42.0, covariance_m2=(4.0, 2.25, -0.5))
+
+
 @dataclass(frozen=True)
 class Told:
     """What a run says, as its report has it."""
@@ -62,6 +66,8 @@ class Told:
             "hollows": r["hollows"] and {k: r["hollows"][k] for k in ("voxels", "volume_m3")},
             "grid": r["grid"],
             "target": r["target"],
+            "frame": r["frame"],
+            "datum": r["datum"],
         }
 
     def grid(self, name: str) -> Any:
@@ -74,8 +80,10 @@ def told(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     profile, target, seed = SCENES[request.param]
     folder = tmp_path_factory.mktemp("told")
     bag, sectors = folder / "bag", folder / "sectors"
-    simulate_bag(bag, profile, target(), seed=seed)
-    simulate_bag(sectors, profile, target(), seed=seed, sectors_deg=30.0)
+    # One scene has a name and a place of its own.
+    place: dict[str, Any] = {"datum": DATUM, "frame": "auv_1/scene"} if request.param == "box" else {}
+    simulate_bag(bag, profile, target(), seed=seed, **place)
+    simulate_bag(sectors, profile, target(), seed=seed, sectors_deg=30.0, **place)
     found: dict[str, Told] = {}
 
     def tell(name: str, make: Any, source: Path, **options: Any) -> None:
@@ -116,6 +124,31 @@ def test_the_last_live_message_says_what_the_report_says(told: dict[str, Told]) 
         boxes = dict(objects_from_msg(last["objects"]))
         assert len(boxes) == len(report["objects"])
         assert boxes[1].size_m[0] == report["dimensions"]["length_m"]
+
+
+def test_where_on_earth_objects_are_is_told_in_the_report_and_on_topics(told: dict[str, Told]) -> None:
+    report = told["replay"].report
+    if report["datum"] is None:
+        assert {one["place"] for one in report["objects"]} == {None}
+        return
+    datum = Datum(**{k: tuple(v) if isinstance(v, list) else v for k, v in report["datum"].items()})
+    assert datum == DATUM
+    with BagReader(told["replay"].folder / "result.mcap") as reader:
+        last = {m.topic.rpartition("/csas/")[2]: m.decode() for m in reader.messages()}
+    (one,) = report["objects"]
+    place = one["place"]
+    latitude, longitude = DATUM.to_latlon(*one["dimensions"]["position_m"])
+    assert (place["latitude_deg"], place["longitude_deg"]) == (latitude, longitude)
+    assert place["sigma_east_m"] > 2.0
+    values = {v.key: v.value for s in last["measurements"].status if s.name == "object 1" for v in s.values}
+    assert {name: float(values[name]) for name in place} == place
+    transform = last["scene_transform"]
+    assert (transform.header.frame_id, transform.child_frame_id) == ("earth", "auv_1/scene")
+    # Of the diagnostics of the nodes nobody says where they are.
+    framed = {name: m.header.frame_id for name, m in last.items() if hasattr(m, "header")}
+    others = {name: frame for name, frame in framed.items() if frame != "auv_1/scene"}
+    assert set(others) <= {"progress", "/diagnostics", "scene_transform"}, others
+    assert f"place: {latitude:.7f}° N" in (told["replay"].folder / "summary.txt").read_text()
 
 
 def test_the_graph_publishes_everything_that_a_results_folder_holds(told: dict[str, Told]) -> None:

@@ -15,6 +15,7 @@ from .camera import (
     view_ground_to_pixel,
 )
 from .frames import (
+    SCENE_FRAME,
     TWO_PI,
     Acoustics,
     FloatArray,
@@ -22,10 +23,12 @@ from .frames import (
     aspects_of_step,
     cross_range_axis,
     down_range_axis,
+    one_frame,
     unit_to_sonar,
     wrap_angle,
 )
 from .passage import Passage, passage
+from .place import Datum, Origin, Place, origin_of
 from .runs import TrackBook, TrackPiece
 from .track import (
     AspectGap,
@@ -41,14 +44,18 @@ from .views import (
 )
 
 __all__ = [
+    "SCENE_FRAME",
     "TWO_PI",
     "Acoustics",
     "AspectGap",
     "CoherentImage",
+    "Datum",
     "DoubtfulArc",
     "FloatArray",
     "GroundGrid",
+    "Origin",
     "Passage",
+    "Place",
     "ShadowCamera",
     "Track",
     "TrackBook",
@@ -60,6 +67,8 @@ __all__ = [
     "down_range_axis",
     "fit_target_to_focus",
     "looks_at",
+    "one_frame",
+    "origin_of",
     "passage",
     "shadow_matrix",
     "unit_to_sonar",

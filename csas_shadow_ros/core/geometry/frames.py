@@ -13,7 +13,29 @@ from ..errors import GeometryError, ParameterError, check_range
 
 FloatArray = NDArray[np.float64]
 
+#: The scene frame's name where nobody gives another one.
+SCENE_FRAME = "csas_scene"
+
 TWO_PI = 2.0 * math.pi
+
+
+def one_frame(what: str, frame: str, expected: str, of: str) -> None:
+    """Refuse something of a run that is in another frame than the rest.
+
+    Parameters
+    ----------
+    what, frame : str
+        What it is, and its frame.
+    expected, of : str
+        The run's frame, and what is in it.
+
+    Raises
+    ------
+    GeometryError
+        Naming both frames.
+    """
+    if frame != expected:
+        raise GeometryError(f"{what} is in frame {frame!r}; expected that of {of}, {expected!r}")
 
 
 def wrap_angle(angle_rad: Any) -> Any:

@@ -194,6 +194,7 @@ class _Selection:
                 max_gap_rad=self.track.max_gap_rad,
                 breaks=self._breaks(kept),
                 doubtful=self.doubtful,
+                frame=self.track.frame,
             )
         self._tell_height(track)
         return Passage(track, tuple(self.notes))

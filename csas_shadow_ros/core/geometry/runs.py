@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import TrackError, check_range
-from .frames import FloatArray, wrap_angle
+from ..errors import GeometryError, TrackError, check_range
+from .frames import SCENE_FRAME, FloatArray, one_frame, wrap_angle
 from .track import Track
 
 IntArray = NDArray[np.int64]
@@ -37,6 +37,8 @@ class TrackPiece:
         Stamp of the message itself.
     notes : tuple of str
         Poses that were left out as not usable, one line each.
+    frame : str
+        Name of the scene frame that it is in: one for all of a run.
 
     Raises
     ------
@@ -48,6 +50,7 @@ class TrackPiece:
     positions_m: FloatArray
     header_ns: int | None = None
     notes: tuple[str, ...] = ()
+    frame: str = field(default=SCENE_FRAME, kw_only=True)
 
     def __post_init__(self) -> None:
         stamps = np.asarray(self.stamps_ns, dtype=np.int64)
@@ -82,6 +85,7 @@ class _Run:
     positions: FloatArray
     #: Stamps that this run goes by: of its first pose, and of what were first poses before others came.
     names: set[int]
+    frame: str
     notes: list[str] = field(default_factory=list)
     _track: Track | None = None
     _margin_ns: int | None = None
@@ -193,12 +197,22 @@ class TrackBook:
         """Take a piece and return the name of the run that it belongs to.
 
         A run that is called otherwise now, as an earlier pose came or two runs became one, is in `renamed`.
+
+        Raises
+        ------
+        TrackError
+            If the piece goes by the name of a run in another frame.
         """
         run = self._find(piece)
         if run is None:
-            run = _Run(piece.stamps_ns, piece.positions_m, {piece.first_ns})
+            run = _Run(piece.stamps_ns, piece.positions_m, {piece.first_ns}, piece.frame)
             run.limit(self._max_poses)
         else:
+            what = f"piece of a track from {piece.first_ns} to {piece.last_ns} ns"
+            try:
+                one_frame(what, piece.frame, run.frame, f"its run, {run.first} ns")
+            except GeometryError as error:
+                raise TrackError(str(error)) from error
             self._runs.remove(run)
             run.take(piece.stamps_ns, piece.positions_m, self._max_poses)
         run.notes += [note for note in piece.notes if note not in run.notes]
@@ -250,8 +264,14 @@ class TrackBook:
         """
         run = self._run(run_ns)
         if run._track is None:
-            run._track = Track(run.stamps.copy(), run.positions, max_gap_rad=self.max_gap_rad)
+            run._track = Track(
+                run.stamps.copy(), run.positions, max_gap_rad=self.max_gap_rad, frame=run.frame
+            )
         return run._track
+
+    def frame(self, run_ns: int) -> str:
+        """Return the name of a run's frame."""
+        return self._run(run_ns).frame
 
     def notes(self, run_ns: int) -> tuple[str, ...]:
         """Return what the pieces of a run said of poses that were left out."""
@@ -271,18 +291,20 @@ class TrackBook:
             if piece.first_ns in run.names or piece.header_ns in run.names:
                 return run
         agreeing = []
-        for run in self._runs:
+        # What is near in one frame is anywhere in another.
+        alike = [run for run in self._runs if run.frame == piece.frame]
+        for run in alike:
             apart = run.apart(piece.stamps_ns, piece.positions_m)
             if apart is None:
                 # A window that spans the run has no pose in its time where that is one pose long.
-                other = _Run(piece.stamps_ns, piece.positions_m, set())
+                other = _Run(piece.stamps_ns, piece.positions_m, set(), piece.frame)
                 apart = other.apart(run.stamps, run.positions)
             if apart is not None and apart <= _SAME_PLACE:
                 agreeing.append((apart, run))
         if agreeing:
             return min(agreeing, key=lambda one: one[0])[1]
-        for run in reversed(self._runs):
-            other = _Run(piece.stamps_ns, piece.positions_m, set())
+        for run in reversed(alike):
+            other = _Run(piece.stamps_ns, piece.positions_m, set(), piece.frame)
             if self._goes_on(run, other) or self._goes_on(other, run):
                 return run
         return None
@@ -311,7 +333,7 @@ class TrackBook:
         again = True
         while again:
             again = False
-            for other in list(self._runs):
+            for other in [one for one in self._runs if one.frame == run.frame]:
                 apart = other.apart(run.stamps, run.positions)
                 meets = apart is not None and apart <= _SAME_PLACE
                 if not (meets or self._goes_on(run, other) or self._goes_on(other, run)):

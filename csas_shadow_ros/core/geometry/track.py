@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import TrackError, check_range
-from .frames import TWO_PI, FloatArray, wrap_angle
+from .frames import SCENE_FRAME, TWO_PI, FloatArray, wrap_angle
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,8 @@ class Track:
         no neighbours (see `passage`).
     doubtful : sequence of DoubtfulArc
         Arcs where it is not known which of several passages counts: they count as gaps.
+    frame : str
+        Name of the scene frame that it is in: one for all of a run.
 
     Raises
     ------
@@ -87,6 +89,7 @@ class Track:
         max_gap_rad: float = math.radians(3.0),
         breaks: ArrayLike = (),
         doubtful: Sequence[DoubtfulArc] = (),
+        frame: str = SCENE_FRAME,
     ) -> None:
         stamps = np.asarray(stamps_ns, dtype=np.int64)
         positions = np.array(positions_m, dtype=np.float64)
@@ -115,6 +118,7 @@ class Track:
         if ground.min() < 1e-9:
             raise TrackError(f"track pose {int(ground.argmin())} is over the scene's origin: no aspect there")
         self.stamps_ns = stamps
+        self.frame = frame
         self.positions_m = positions
         self.max_gap_rad = check_range("max_gap_rad", max_gap_rad, 0, math.pi, "rad", open_low=True)
         #: Aspect of each pose, unwrapped along the track (rad).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import GeometryError
 from .camera import ShadowCamera
-from .frames import TWO_PI, Acoustics, FloatArray, GroundGrid, down_range_axis
+from .frames import SCENE_FRAME, TWO_PI, Acoustics, FloatArray, GroundGrid, down_range_axis
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,8 @@ class ViewInfo:
         Wavenumber (kx, ky), scene axes, that was divided out; (0, 0) where not demodulated.
     focus_range_m : float
         r₀ = e_r · target; NaN before enhancement.
+    frame : str
+        Name of the scene frame that it is in: one for all of a run.
     """
 
     stamp_ns: int
@@ -44,6 +46,7 @@ class ViewInfo:
     aperture_rad: float
     carrier_rad_m: tuple[float, float] = (0.0, 0.0)
     focus_range_m: float = math.nan
+    frame: str = field(default=SCENE_FRAME, kw_only=True)
 
     @property
     def resolution_m(self) -> tuple[float, float]:
@@ -115,12 +118,15 @@ class CoherentImage:
         Its band.
     stamp_ns : int
         Stamp of the message that it came in.
+    frame : str
+        Name of the scene frame that it is in: one for all of a run.
     """
 
     pixels: NDArray[Any]
     grid: GroundGrid
     acoustics: Acoustics
     stamp_ns: int = 0
+    frame: str = field(default=SCENE_FRAME, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.pixels.shape != self.grid.shape:

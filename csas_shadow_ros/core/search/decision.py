@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from ..errors import NoTargetError, ViewError
-from ..geometry import TWO_PI, CoherentImage, Track, View, fit_target_to_focus, wrap_angle
+from ..geometry import TWO_PI, CoherentImage, Track, View, ViewInfo, fit_target_to_focus, wrap_angle
 from ..parameters import (
     MAX_OBJECTS,
     PipelineParameters,
@@ -38,12 +38,29 @@ class Decision:
         Bodies that the search found and that are not carved, and why.
     sign : SignEvidence or None
         Whether the shadows fit the stated spectrum sign; None if it was not checked.
+    frame : str or None
+        Name of the scene frame that places are in; None: that of the views, whichever it is.
     """
 
     target: Target | None
     others: tuple[Target, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
     sign: SignEvidence | None = None
+    frame: str | None = None
+
+    def require_frame(self, view: ViewInfo) -> None:
+        """Refuse a view in another frame.
+
+        Raises
+        ------
+        ViewError
+            Naming both frames.
+        """
+        if self.frame is not None and view.frame != self.frame:
+            raise ViewError(
+                f"view stamped {view.stamp_ns} ns is in frame {view.frame!r}; expected that of the target,"
+                f" {self.frame!r}"
+            )
 
     def same_target(self, other: Decision) -> bool:
         """Say whether views made for one decision serve the other: the same volumes are carved."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.frames import SCENE_FRAME
 from ..mesh import Dimensions
 from ..volume import Target, VoxelGrid
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ..composites import Composites
-    from ..geometry import View
+    from ..geometry import Datum, Place, View
     from ..hollows import EchoLook
     from ..measurement import SilhouetteSides
     from ..search.decision import Decision
@@ -183,6 +184,10 @@ class Result:
         Bodies of the search that are no objects, and why.
     timings_s : dict
         Seconds of wall time by step.
+    frame : str
+        Name of the scene frame.
+    datum : Datum or None
+        Where on earth that frame's origin is; None: nobody said.
     """
 
     run_ns: int | None = None
@@ -210,6 +215,12 @@ class Result:
     further: list[ObjectResult] = field(default_factory=list)
     left_out: list[LeftOut] = field(default_factory=list)
     timings_s: dict[str, float] = field(default_factory=dict)
+    frame: str = SCENE_FRAME
+    datum: Datum | None = None
+
+    def place_of(self, dimensions: Dimensions) -> Place | None:
+        """Return where on earth one of its objects is; None without a datum."""
+        return None if self.datum is None else self.datum.place_of(dimensions)
 
     @property
     def by_likelihood_alone(self) -> bool:

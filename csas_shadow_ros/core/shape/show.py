@@ -29,6 +29,8 @@ def table(result: Result) -> list[tuple[str, str]]:
     for number, one in enumerate(result.objects, start=1):
         prefix = "" if len(result.objects) == 1 else f"object {number}: "
         rows += [(prefix + name, value) for name, value in _measures(one.dimensions)]
+        if (place := result.place_of(one.dimensions)) is not None:
+            rows.append((f"{prefix}place", f"{place}, bearing {place.bearing_deg:.1f}°"))
     if (grid := result.grid) is not None:
         nz, ny, nx = grid.volume.shape
         rows.append(("grid", f"{nx} × {ny} × {nz} voxels of {grid.volume.voxel_size_m:g} m, {grid.method}"))
@@ -60,7 +62,10 @@ def text(result: Result) -> str:
     """Return a result in a few lines."""
     lines = [f"Result: {result.verdict}, quality {result.quality.verdict}"]
     lines += [f"  {reason}" for reason in result.quality.reasons]
-    lines += [f"  {one.dimensions}" for one in result.objects]
+    for one in result.objects:
+        lines.append(f"  {one.dimensions}")
+        if (place := result.place_of(one.dimensions)) is not None:
+            lines.append(f"  {place}, bearing {place.bearing_deg:.1f}°")
     if not result.objects:
         lines.append(f"  {no_object_reason(result)}")
     lines.append(f"  {table(result)[-1][1]}".replace(" used", " views used"))
@@ -78,8 +83,7 @@ def as_html(result: Result) -> str:
     )
     picture = base64.b64encode(plot(result).png(_SMALL_DPI)).decode()
     return (
-        f"<table>{rows}</table>"
-        f"<img alt='plan, side and best shadow' src='data:image/png;base64,{picture}'>"
+        f"<table>{rows}</table><img alt='plan, side and best shadow' src='data:image/png;base64,{picture}'>"
     )
 
 
@@ -101,6 +105,8 @@ def to_xarray(result: Result) -> xarray.Dataset:
         names = ("length_m", "width_m", "height_m", "volume_m3", "heading_rad")
         attributes |= {name: getattr(d, name) for name in names}
         attributes |= {"x_m": d.position_m[0], "y_m": d.position_m[1]}
+        if (place := result.place_of(d)) is not None:
+            attributes |= vars(place)
     if (grid := result.grid) is None:
         return xarray.Dataset(attrs=attributes)
     volume, dims = grid.volume, ("z", "y", "x")
@@ -112,7 +118,7 @@ def to_xarray(result: Result) -> xarray.Dataset:
         "method": grid.method,
         "threshold": grid.threshold,
         "voxel_size_m": volume.voxel_size_m,
-        "frame": "csas_scene",
+        "frame": result.frame,
     }
     return xarray.Dataset(
         {

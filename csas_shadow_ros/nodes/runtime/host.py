@@ -28,6 +28,10 @@ class Host(Protocol):
         """Name of the node."""
 
     @property
+    def scene_frame(self) -> str:
+        """The one frame that messages may be in; empty: any, as long as a run has one."""
+
+    @property
     def trouble(self) -> str:
         """What stops it from working; empty if nothing does."""
 

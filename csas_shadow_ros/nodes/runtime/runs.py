@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from csas_shadow_ros.core.geometry.runs import TrackBook
-from msg_adapters import TOPICS, message_from_cdr, track_piece_from_msg
+from msg_adapters import TOPICS, frame_of, message_from_cdr, track_piece_from_msg
 
 from .. import qos
 
@@ -33,14 +33,20 @@ class RunFollower:
     def __init__(self, node: CsasNode, on_track: Callable[[int, dict[int, int]], None] | None = None) -> None:
         self.book = TrackBook()
         self._on_track = on_track
+        self._frame = node.parameters.scene_frame
         # Raw: rclpy makes an object of each pose, which takes seconds where there are 200 000.
         node.subscribe_latched("track", self._take, profile=qos.TRACK, raw=True)
 
     def _take(self, cdr: bytes) -> None:
         path = message_from_cdr(cdr, TOPICS["track"].type_name, "track")
+        frame_of(path, "track", self._frame)
         name = self.book.add(track_piece_from_msg(path))
         if self._on_track is not None:
             self._on_track(name, dict(self.book.renamed))
+
+    def last_of(self, run_ns: int | None) -> int | None:
+        """Return the stamp of a run's last pose; None where no track tells it."""
+        return self.book.span(run_ns)[1] if run_ns in self.book.names and run_ns is not None else None
 
     def run_of(self, stamp_ns: int) -> int | None:
         """Return the name of the run whose track covers a stamp; None if none does."""
