@@ -73,7 +73,7 @@ def read_parameter_file(path: str | Path) -> dict[str, Any]:
         range, or two nodes contradict each other.
     """
     # Here and not above: the nodes' package stands over this one. It needs no ROS either.
-    from .nodes.params import NODES
+    from .nodes.params import NODES, OF_RCLPY
 
     try:
         document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
@@ -89,6 +89,7 @@ def read_parameter_file(path: str | Path) -> dict[str, Any]:
             known = {field.name for field in dataclasses.fields(NODES[node])}
         else:
             raise ParameterError(f"{path}: unknown node {node!r}; expected /** or one of: {', '.join(NODES)}")
+        parameters = {k: v for k, v in parameters.items() if not k.startswith(OF_RCLPY)}
         for name, value in parameters.items():
             if name not in known:
                 raise ParameterError(

@@ -10,7 +10,7 @@ from csas_shadow_ros.bags import BagReader, MessagePair, iterate_pairs
 from csas_shadow_ros.bags.pairs import Problem
 from csas_shadow_ros.bags.tracks import BagRuns
 from csas_shadow_ros.core.errors import BagError, CsasError, ParameterError
-from msg_adapters import coherent_image_from_msgs, track_to_msg
+from msg_adapters import coherent_image_from_msgs, stamp_from_ns, track_to_msg
 
 from . import qos
 from .base import CsasNode, Source, run_node
@@ -29,6 +29,9 @@ class BagPlayerNode(CsasNode):
         self.reader = BagReader(self.parameters.bag, self.parameters.bag_namespace or None)
         self.views: BagViews | None = None
         self._began: tuple[float, float] | None = None
+        #: The view that was sent last, and when the latched image was recorded.
+        self._sent: int | None = None
+        self._latched_ns = 0
         #: When the next view is to be sent at the chosen rate, on the monotonic clock.
         self._due_s = 0.0
         stage = stage_of_bag(self.reader, self.parameters.stage)
@@ -46,6 +49,8 @@ class BagPlayerNode(CsasNode):
             self.latch("target")
         self.latch_track()
         self.latch_origin()
+        if self.parameters.clock_hz > 0:
+            self.start_clock()
         for line in (*self.reader.problems, *(self.views.problems if self.views else ())):
             self.reject(line)
 
@@ -77,6 +82,7 @@ class BagPlayerNode(CsasNode):
                 self._problem(Problem(pair.topic, pair.number, pair.stamp_ns, str(error)))
         if chosen is None:
             raise BagError(f"{self.parameters.bag} holds no image with a camera_info of the same stamp")
+        self._latched_ns = chosen.stamp_ns
         self.latch("camera_info", chosen.info_cdr)
         self.latch("image", chosen.image_cdr)
 
@@ -95,6 +101,36 @@ class BagPlayerNode(CsasNode):
 
     def _problem(self, problem: Problem) -> None:
         self.reject(str(problem))
+
+    # Time
+
+    def start_clock(self) -> None:
+        """Publish, from now on, when what is played was recorded."""
+        from rosgraph_msgs.msg import Clock
+
+        publisher = self.own_publisher(Clock, "/clock", qos.CLOCK)
+
+        def tell() -> None:
+            if self.active:
+                publisher.publish(Clock(clock=stamp_from_ns(self.messages, self.recorded_ns())))
+
+        self.every(1.0 / self.parameters.clock_hz, tell)
+
+    def recorded_ns(self) -> int:
+        """Return the recording's time at which playing is: a latched image's is the end of its run."""
+        if self.views is None:
+            return self._latched_ns
+        times = self.views.times
+        if self._sent is None or self._began is None:
+            return next(iter(times.values()), 0)
+        first_ns, at_s = next(iter(times.values())), self._schedule[self._sent]
+        if (rate := self.parameters.rate) > 0:
+            since, first = self._began
+            later = [at for at in self._schedule.values() if at > at_s]
+            # Time goes on between two views, and waits for the next one where that is late.
+            now_s = first + (time.monotonic() - since) * rate
+            at_s = max(at_s, min(now_s, later[0] if later else at_s))
+        return first_ns + round(at_s * 1e9)
 
     # Views
 
@@ -121,6 +157,8 @@ class BagPlayerNode(CsasNode):
         image, info = self.views.get(stamp)
         if self._began is None:
             self._began = (time.monotonic(), self._schedule[stamp])
+        if self._sent is None or self._schedule[stamp] > self._schedule[self._sent]:
+            self._sent = stamp  # one that is sent again turns no clock back
         self.source.info.publish(info)
         self.source.image.publish(image)
 

@@ -18,6 +18,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
@@ -131,6 +133,7 @@ class CsasNode(LifecycleNode):
         declare(self, self.parameters)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.instance = ""
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.messages = RclpyMessages()
         self.active = False
         self.counts: Counter[str] = Counter()
@@ -258,8 +261,11 @@ class CsasNode(LifecycleNode):
             one.look()
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """Call back periodically while the node is configured."""
-        made = self.create_timer(period_s, lambda: self.guard("timer", callback))
+        """Call back periodically while the node is configured.
+
+        On steady time: a node that goes by `/clock` works on while that stands still, jumps or is not there.
+        """
+        made = self.create_timer(period_s, lambda: self.guard("timer", callback), clock=self._steady)
         self._owned.append((self.destroy_timer, made))
 
     def background(self, callback: Callable[[], None]) -> Background:

@@ -182,6 +182,13 @@ class BagPlayerNodeParameters(NodeParameters, FlowParameters):
     rate: float = bounded(
         1.0, "views: times the recorded speed; 0: as fast as they are taken", low=0.0, high=1e6
     )
+    clock_hz: float = bounded(
+        0.0,
+        "publish /clock so often: the time when what is played was recorded; 0: not",
+        low=0.0,
+        high=1000.0,
+        unit="Hz",
+    )
 
 
 @dataclass(frozen=True)
@@ -226,7 +233,7 @@ NODES: dict[str, type[Parameters]] = {
 DYNAMIC = frozenset({"window", "resend_s", "sink_wait_s", "publish_hz", "dynamic_range_db", "rate"})
 
 #: Overrides that belong to rclpy itself.
-_OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 
 def part(parameters: Parameters, kind: type[P]) -> P:
@@ -242,7 +249,7 @@ def from_overrides(kind: type[P], overrides: Mapping[str, Any]) -> P:
     ParameterError
         If a name is unknown or a value out of range.
     """
-    return kind.from_mapping({k: v for k, v in overrides.items() if not k.startswith(_OF_RCLPY)})
+    return kind.from_mapping({k: v for k, v in overrides.items() if not k.startswith(OF_RCLPY)})
 
 
 def expected_of(field: dataclasses.Field[Any]) -> str:

@@ -41,5 +41,8 @@ REPORTS = _profile(4096, latched=True)
 #: Heartbeats: only the last one means anything. transient_local, or it would not match `REPORTS` readers.
 HEARTBEAT = _profile(1, latched=True)
 
+#: /clock, as rosbag2 and simulators publish it: reliable, so that every reader takes it.
+CLOCK = _profile(1, latched=False)
+
 #: /diagnostics, as every ROS tool expects it.
 DIAGNOSTICS = _profile(10, latched=False)
