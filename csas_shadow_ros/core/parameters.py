@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar, get_args
 from .errors import ParameterError
 from .geometry.place import Datum
 
-T = TypeVar("T")
+P = TypeVar("P", bound="Parameters")
 
 #: Kinds of views, first to last.
 Stage = Literal["sub_aperture", "shadow", "likelihood", "shadow_mask"]
@@ -103,20 +103,31 @@ class Parameters:
                 checked = _check_number(name, value, field)
             object.__setattr__(self, name, checked)
 
+    def check(self) -> None:
+        """Check what belongs together; each field has its own bounds, and was checked when it was made.
+
+        Raises
+        ------
+        ParameterError
+            Naming the parameters that do not go together.
+        """
+
     @classmethod
-    def from_mapping(cls: type[T], values: Mapping[str, Any]) -> T:
+    def from_mapping(cls: type[P], values: Mapping[str, Any]) -> P:
         """Make a parameter set from a mapping; unknown names are refused.
 
         Raises
         ------
         ParameterError
-            If a name is unknown or a value is out of range.
+            If a name is unknown, a value is out of range, or two do not go together.
         """
-        known = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+        known = [f.name for f in dataclasses.fields(cls)]
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise ParameterError(f"unknown parameter {unknown[0]!r}; expected one of: {', '.join(known)}")
-        return cls(**values)
+        made = cls(**values)
+        made.check()
+        return made
 
 
 #: Bodies carved if nothing else is asked for, the target among them. Each further one takes about half
@@ -272,8 +283,9 @@ class PlaceParameters(Parameters):
         optional=True,
     )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def check(self) -> None:
+        """Refuse half a place."""
+        super().check()
         if math.isnan(self.origin_lat_deg) != math.isnan(self.origin_lon_deg):
             given, lacking = ("lat", "lon") if math.isnan(self.origin_lon_deg) else ("lon", "lat")
             raise ParameterError(f"origin_{given}_deg is given, origin_{lacking}_deg is not; expected both")
@@ -292,6 +304,7 @@ class PlaceParameters(Parameters):
             What topic origin says. Latitude and longitude that are given come before it; a heading that is
             given turns it.
         """
+        self.check()
         if self.given:
             heading = 0.0 if math.isnan(self.origin_heading_deg) else self.origin_heading_deg
             variance = self.origin_sigma_m**2

@@ -14,7 +14,8 @@ import time
 import traceback
 import uuid
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import rclpy
@@ -22,6 +23,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -65,7 +67,7 @@ from msg_adapters.topics import topic as topic_of
 
 from . import qos
 from .flow import Flow
-from .params import NODES, declare, from_overrides
+from .params import DYNAMIC, NODES, declare, from_overrides
 from .rivals import Rivals
 from .runtime.host import Host
 
@@ -135,7 +137,10 @@ class CsasNode(LifecycleNode):
         self.instance = ""
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.messages = RclpyMessages()
-        self.active = False
+        self.active = self._configured = False
+        #: Topics of the contract that it has subscribed to, and that it publishes.
+        self._takes: dict[str, None] = {}
+        self._gives: dict[str, None] = {}
         self.counts: Counter[str] = Counter()
         self.reasons: Counter[str] = Counter()
         #: The first reason of each kind, word for word.
@@ -209,6 +214,7 @@ class CsasNode(LifecycleNode):
 
     def publisher(self, topic: str, profile: Any) -> Publisher:
         """Make a publisher of a topic of the contract."""
+        self._gives[topic] = None
         return self.own_publisher(self.messages.cls(topic_of(topic).type_name), topic, profile)
 
     def own_publisher(self, kind: Any, topic: str, profile: Any) -> Publisher:
@@ -227,7 +233,11 @@ class CsasNode(LifecycleNode):
                 self.guard(topic, callback, msg)
 
         kind = self.messages.cls(topic_of(topic).type_name)
-        made = self.create_subscription(kind, topic, guarded, profile, raw=raw)
+        # Not rclpy's own warnings: of two subscriptions to a topic one may hear what the other cannot.
+        # Of publishers that none of them hears `Strangers` tells.
+        quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
+        made = self.create_subscription(kind, topic, guarded, profile, raw=raw, event_callbacks=quiet)
+        self._takes[topic] = None
         self._owned.append((self.destroy_subscription, made))
         self.strangers.subscribed(made)
         return made
@@ -471,6 +481,7 @@ class CsasNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Make everything; refuse with one line if that cannot be done."""
+        self._configured = True
         # Whatever an earlier configuration reported is forgotten with its state.
         self.instance = instance_of(self.rivals.graph_id, uuid.uuid4().hex[:12])
         try:
@@ -478,6 +489,7 @@ class CsasNode(LifecycleNode):
             self._heartbeats = self.publisher("progress", qos.HEARTBEAT)
             self._diagnostics = self.publisher("/diagnostics", qos.DIAGNOSTICS)
             self.error = self.unable = ""
+            self.parameters.check()
             self.setup()
             self.every(1.0, self._publish_diagnostics)
             self.every(_WHO_S, self.strangers.look)
@@ -486,6 +498,7 @@ class CsasNode(LifecycleNode):
             self.error = str(error)
             self.get_logger().error(self.error)
             self._destroy_owned()
+            self._configured = False
             return TransitionCallbackReturn.FAILURE
         return super().on_configure(state)
 
@@ -507,6 +520,7 @@ class CsasNode(LifecycleNode):
         # Heartbeats go on meanwhile: others know already that this node is there.
         self.preload()
         self.on_activated()
+        self.get_logger().info(f"active: takes {_brief(self._takes)}; gives {_brief(self._gives)}")
         for source in self.sources:
             source.wake()
         return super().on_activate(state)
@@ -521,6 +535,7 @@ class CsasNode(LifecycleNode):
         self.finish()
         self._destroy_owned()
         self.forget()
+        self._configured = False
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -547,6 +562,8 @@ class CsasNode(LifecycleNode):
         self.inlets.clear()
         self.sources.clear()
         self._unlatched.clear()
+        self._takes.clear()
+        self._gives.clear()
         self.strangers.clear()
         while self._owned:
             destroy, entity = self._owned.pop()
@@ -566,10 +583,14 @@ class CsasNode(LifecycleNode):
     def _on_set_parameters(self, changes: list[Parameter]) -> Any:
         from rcl_interfaces.msg import SetParametersResult
 
-        values = {f: getattr(self.parameters, f) for f in self.parameters.__dataclass_fields__}
-        own = {c.name: c.value for c in changes if c.name in values}
+        known = self.parameters.__dataclass_fields__
+        own = {c.name: c.value for c in changes if c.name in known}
+        if self._configured and (fixed := [name for name in own if name not in DYNAMIC]):
+            reason = f"{fixed[0]} can be set while the node is unconfigured; expected: cleanup first"
+            return SetParametersResult(successful=False, reason=reason)
         try:
-            changed = type(self.parameters).from_mapping(values | own)
+            # What belongs together may come one by one: it is checked when the node is configured.
+            changed = replace(self.parameters, **own)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         self.parameters = changed
@@ -751,6 +772,16 @@ class Strangers:
         if offered.durability == DurabilityPolicy.VOLATILE:
             return f"{who} publishes {expected} volatile, which is not taken; expected it transient local"
         return f"{who} publishes {expected} with a QoS that is not taken: {checks[0][1].rstrip('; ')}"
+
+
+def _brief(topics: Iterable[str]) -> str:
+    """Name topics in one line: the two of a stream as one, and not what every node has."""
+    told = dict.fromkeys(
+        re.sub("/(image|camera_info)$", "/*", name)
+        for name in topics
+        if name not in ("progress", "/diagnostics")
+    )
+    return ", ".join(told) or "nothing"
 
 
 def _type_name(kind: Any) -> str:

@@ -147,8 +147,9 @@ class VoxelCarverNodeParameters(
         True, "carve by the other method too, on other_method/*; it finds what is too thin for silhouettes"
     )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def check(self) -> None:
+        """Refuse half a place."""
+        super().check()
         if math.isnan(self.parent_lat_deg) != math.isnan(self.parent_lon_deg):
             raise ParameterError("of parent_lat_deg and parent_lon_deg one is given; expected both or none")
 
@@ -289,8 +290,8 @@ def declare(node: Any, parameters: Parameters) -> None:
         descriptor = ParameterDescriptor(
             name=field.name,
             description=description_of(field),
-            additional_constraints=expected_of(field),
-            read_only=field.name not in DYNAMIC,
+            additional_constraints=expected_of(field)
+            + ("" if field.name in DYNAMIC else "; set while the node is unconfigured"),
         )
         if meta["optional"]:
             pass  # rclpy finds that NaN is out of any range; `_on_set_parameters` checks it

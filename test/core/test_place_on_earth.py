@@ -132,7 +132,7 @@ def test_the_newest_origin_of_the_frame_before_the_runs_end_counts() -> None:
 
 def test_a_latitude_without_a_longitude_is_refused() -> None:
     with pytest.raises(ParameterError, match="origin_lat_deg is given, origin_lon_deg is not; expected both"):
-        PlaceParameters(origin_lat_deg=48.0)
+        PlaceParameters.from_mapping({"origin_lat_deg": 48.0})
 
 
 def test_given_parameters_come_before_what_a_topic_says_and_a_given_heading_turns_it() -> None:

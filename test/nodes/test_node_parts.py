@@ -82,7 +82,8 @@ def test_descriptors_say_the_bounds_of_the_dataclasses(graph: Graph, name: str) 
             descriptor = node.describe_parameter(field.name)
             meta = field.metadata
             assert meta["doc"] in descriptor.description
-            assert descriptor.read_only == (field.name not in params.DYNAMIC)
+            fixed = "set while the node is unconfigured" in descriptor.additional_constraints
+            assert fixed == (field.name not in params.DYNAMIC)
             ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
             is_number = isinstance(field.default, int | float) and not isinstance(field.default, bool)
             # rclpy finds NaN, which says that nothing is given, to be out of any range.
@@ -129,7 +130,7 @@ def test_setting_a_parameter_out_of_range_is_refused_and_in_range_takes_effect(g
     assert node.set_parameters([Parameter("window", value=2)])[0].successful
     assert node.source.flow.window == 2
     frozen = node.set_parameters([Parameter("bag", value="other")])[0]
-    assert not frozen.successful, "a read-only parameter cannot change in mid-run"
+    assert not frozen.successful, "such a parameter cannot change in mid-run"
 
 
 def test_a_given_target_needs_its_size(graph: Graph) -> None:
