@@ -21,7 +21,7 @@ from .core.parameters import STAGES, START_FROM, PipelineParameters, PlaceParame
 
 PROGRAM = "csas-shadow"
 ALL_RUNS = "all"
-OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
+OK, FAILED, USAGE, PARTIAL, UNEXPECTED = 0, 1, 2, 3, 4
 #: Shadows may leave the image by so much of its half side before a simulation is said to be too small.
 _MAX_REACH = 1.6
 
@@ -40,7 +40,8 @@ a first try, from nothing to a 3-D shape (half a minute):
   csas-shadow info box_results
 
 exit codes: 0 done, 1 it failed (one line says why), 2 the command line is wrong, 3 the results are
-there, but a part beside the grid failed (a line and report.json say which)."""
+there, but a part beside the grid failed (a line and report.json say which), 4 the results are there,
+but not as --expect says."""
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
@@ -220,6 +221,14 @@ def _results_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="leave writing out to the disk to the system: a power cut may cost it",
     )
+
+
+def _expect_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("continuous integration (docs/replay_in_ci.md)")
+    group.add_argument(
+        "--expect", metavar="YAML", help="values that the report must have; the exit code is 4 if it has not"
+    )
+    group.add_argument("--junit", metavar="FILE", help="write what became of them as JUnit XML")
 
 
 def _parameter_options(parser: argparse.ArgumentParser) -> None:
@@ -494,6 +503,7 @@ def _run_options(p: argparse.ArgumentParser) -> None:
     p.add_argument("--workers", type=int, default=2, metavar="N", help="threads (default 2)")
     _bounded_objects(p)
     _results_options(p)
+    _expect_options(p)
     _parameter_options(p)
     _common(p)
 
@@ -534,6 +544,7 @@ def _replay_options(p: argparse.ArgumentParser) -> None:
     _run_option(p, each=True)
     _bounded_objects(p)
     _results_options(p)
+    _expect_options(p)
     _parameter_options(p)
     _common(p)
 
@@ -800,8 +811,8 @@ def _run(arguments: argparse.Namespace, console: Console) -> int:
     parameters = parameters_of(arguments)
     if arguments.workers < 1:
         raise ParameterError(f"workers is {arguments.workers}; expected 1 or more")
-    code = OK
-    for number, out in _runs_and_folders(arguments):
+
+    def one(number: int | None, out: Path) -> tuple[int, dict[str, Any]]:
         with console.bar("views") as bar:
             report = process_bag(
                 arguments.bag,
@@ -821,7 +832,35 @@ def _run(arguments: argparse.Namespace, console: Console) -> int:
                 progress=bar,
                 notice=console.notice,
             )
-        code = max(code, _give_report(console, out, report))
+        return _give_report(console, out, report), report
+
+    return _each_run(arguments, one)
+
+
+def _each_run(
+    arguments: argparse.Namespace, one: Callable[[int | None, Path], tuple[int, dict[str, Any]]]
+) -> int:
+    """Make the results of each run that is asked for, and hold them against what is expected."""
+    from .expectations import Checked, check_report, read_expectations, write_junit
+
+    # Before anything is made: a slip in the file must not cost a run.
+    expected = read_expectations(arguments.expect) if arguments.expect else ()
+    code, checked, name = OK, list[Checked](), ""
+    try:
+        for number, out in _runs_and_folders(arguments):
+            name = out.name
+            own, report = one(number, out)
+            checked.append(check_report(name, report, expected))
+            for fault in checked[-1].unmet:
+                print(f"{PROGRAM}: error: {name}: {fault}", file=sys.stderr)
+            code = max(code, own, UNEXPECTED if checked[-1].unmet else OK)
+    except (CsasError, OSError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        checked.append(Checked(name or Path(arguments.out).name, {}, error=reason))
+        raise
+    finally:
+        if arguments.junit:
+            write_junit(arguments.junit, checked)
     return code
 
 
@@ -843,8 +882,8 @@ def _replay(arguments: argparse.Namespace, console: Console) -> int:
     from .process import replay_bag
 
     parameters = parameters_of(arguments)
-    code = OK
-    for number, out in _runs_and_folders(arguments):
+
+    def one(number: int | None, out: Path) -> tuple[int, dict[str, Any]]:
         with console.bar("views") as bar:
             report = replay_bag(
                 arguments.bag,
@@ -864,12 +903,14 @@ def _replay(arguments: argparse.Namespace, console: Console) -> int:
                 progress=bar,
                 notice=console.notice,
             )
-        code = max(code, _give_report(console, out, report))
+        code = _give_report(console, out, report)
         if lacking := report.get("not_recorded"):
             told = "; ".join(lacking)
             print(f"{PROGRAM}: error: the recording is not whole: {told}", file=sys.stderr)
             code = max(code, FAILED)
-    return code
+        return code, report
+
+    return _each_run(arguments, one)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

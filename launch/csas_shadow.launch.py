@@ -42,6 +42,7 @@ ALL, NODES = (REPLAY, PLAY, LIVE), (PLAY, LIVE)
 ARGUMENTS = {
     "bag": ("none", ALL, "bag to play"),
     "results": ("auto", (REPLAY, PLAY), "results folder; none: run until Ctrl-C"),
+    "expect": ("none", (REPLAY,), "file of values that the results must have, as of csas-shadow replay"),
     "stage": ("auto", (REPLAY, PLAY), "which of the bag's stages to play"),
     "rate": ("0.0", (REPLAY, PLAY), "views: times the recorded speed; 0.0: as fast as they are taken"),
     "params": (PathJoinSubstitution([SHARE, "config", "csas_shadow.yaml"]), ALL, "parameters of all nodes"),
@@ -119,7 +120,7 @@ def replay(value):
     command = [sys.executable, "-m", f"{PACKAGE}.cli", "replay", value["bag"], "--out", str(results)]
     command += ["--overwrite", "--params", value["params"], "--rate", value["rate"]]
     command += ["--start-from", value["stage"]]
-    for name in ("domain_id", "origin_lat_deg", "origin_lon_deg", "origin_heading_deg"):
+    for name in ("expect", "domain_id", "origin_lat_deg", "origin_lon_deg", "origin_heading_deg"):
         if value[name]:
             command.append(f"--{name.replace('_', '-')}={value[name]}")
     return [ExecuteProcess(cmd=command, output="screen", sigterm_timeout="20", on_exit=end_of_replay)]

@@ -46,7 +46,9 @@ def test_every_field_falls_under_one_of_the_kinds_that_are_tested_here():
 @pytest.mark.parametrize(("cls", "field"), FIELDS, ids=ids(FIELDS))
 def test_every_field_is_described_and_its_default_is_inside_its_bounds(cls, field):
     assert field.metadata["doc"]
-    assert getattr(cls(), field.name) == field.default
+    # NaN, not given, is the very same object, and no number equals it.
+    default = getattr(cls(), field.name)
+    assert default is field.default or default == field.default
     assert cls.from_mapping({field.name: field.default}) == cls()
     if not isinstance(field.default, bool | str):
         assert field.metadata["low"] < field.metadata["high"]
@@ -60,7 +62,10 @@ def test_a_number_out_of_its_bounds_is_refused(cls, field):
     refused(cls, field, low - 1e-6)
     refused(cls, field, high * (1 + 1e-9) + 1e-9)
     for value in (math.nan, math.inf, -math.inf):
-        refused(cls, field, value)
+        if math.isnan(value) and field.metadata["optional"]:
+            assert math.isnan(getattr(cls(**{field.name: value}), field.name))
+        else:
+            refused(cls, field, value)
 
 
 @pytest.mark.parametrize("value", ["5", None, [1.0], True, 1j])

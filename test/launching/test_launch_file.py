@@ -30,6 +30,7 @@ MODES = {
 OTHER = {
     "bag": "another_bag",
     "results": "elsewhere",
+    "expect": "expect.yaml",
     "stage": "shadow",
     "rate": "2.0",
     "params": str(ROOT / "constraints"),
