@@ -200,6 +200,11 @@ def _from_views(
         usable = False
         for view in run.views(stage):
             usable = True
+            if view.info.frame != run.frame:
+                raise BagError(
+                    f"{run.path}: the {stage} view stamped {view.info.stamp_ns} ns is in frame"
+                    f" {view.info.frame!r}; expected that of the run, {run.frame!r}"
+                )
             for _, problem, remedy in judge_amplitude(view) if stage == "shadow" else ():
                 if not warned:
                     notice(f"warning: view stamped {view.info.stamp_ns} ns: {problem}. {remedy}")

@@ -246,6 +246,7 @@ class _Check:
                 ERROR, "", "the bag holds no messages", "Record it while the topics are being published."
             )
         self.find_track()
+        self.find_origin()
         for stream_name in STREAMS:
             self.check_stream(stream_name)
         self.check_start()
@@ -261,6 +262,22 @@ class _Check:
         known = {absolute_name(t, reader.namespace) for t in TOPICS}
         if others := sorted(set(reader.topics) - known):
             self.say(INFO, "", f"{len(others)} topics are not part of the contract: {', '.join(others[:8])}")
+
+    def find_origin(self) -> None:
+        """Say where on earth the run is, or what is wrong with what the bag says of it."""
+        if self.runs is None:
+            return
+        topic = self.name("origin")
+
+        def report(problem: Problem) -> None:
+            remedy = "Without it objects have no latitude and longitude: see docs/conventions.md, or give"
+            remedy += " origin_lat_deg and origin_lon_deg."
+            place = {"number": problem.number, "stamp_ns": problem.stamp_ns}
+            self.say(WARNING, topic, problem.reason, remedy, **place)
+
+        said = self.runs.origin(report)
+        if said is not None:
+            self.say(INFO, topic, str(said[0].datum))
 
     def find_track(self) -> None:
         topic = self.name("track")
@@ -725,6 +742,13 @@ def _height_of_band(track: Track, ratio: float) -> str:
 
 def judge_view(view: View, track: Track) -> Iterator[tuple[str, str, str]]:
     """Yield (level, problem, remedy) if a view's sonar is not where the track says."""
+    if view.info.frame != track.frame:
+        yield (
+            ERROR,
+            f"the view is in frame {view.info.frame!r}, the track in {track.frame!r}",
+            "Every message of a run carries one frame_id: correct that of the track or of the views.",
+        )
+        return
     stamps = track.stamps_ns - track.stamps_ns[0]
     when = view.info.stamp_ns - int(track.stamps_ns[0])
     step = int(np.median(np.diff(track.stamps_ns)))

@@ -646,7 +646,7 @@ DECISIONS = {
 @pytest.mark.parametrize("name", DECISIONS)
 @pytest.mark.parametrize(("run_ns", "may_move"), [(RUN_NS, True), (None, False)])
 def test_a_decision_survives_to_the_last_digit(factory, name, run_ns, may_move):
-    decision = DECISIONS[name]
+    decision = replace(DECISIONS[name], frame="csas_scene")
     msg = carried(decision_to_msg(factory, decision, STAMP_NS, run_ns, STAMP_NS - 1, may_move))
     news = decision_from_msg(msg)
     assert (news.stamp_ns, news.run_ns, news.target_stamp_ns) == (STAMP_NS, run_ns, STAMP_NS - 1)

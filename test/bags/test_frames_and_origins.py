@@ -19,7 +19,7 @@ from csas_shadow_ros.core.search.decision import Decision
 from csas_shadow_ros.core.subaperture import SubApertures
 from csas_shadow_ros.core.volume import Target
 from csas_shadow_ros.from_bag import reconstruct_run
-from msg_adapters import RosbagsMessages, origin_to_msg
+from msg_adapters import RosbagsMessages, origin_to_msg, view_to_msgs
 
 DATUM = Datum(48.0, -4.5, covariance_m2=(4.0, 4.0, 0.0))
 COARSE = PipelineParameters(
@@ -35,7 +35,9 @@ def test_any_frame_is_taken_that_a_run_uses_throughout(tmp_path: Path, tiny_box_
     made = tiny_box_bag.run
     image, track = replace(made.image, frame="auv/scene"), in_frame(made.track, "auv/scene")
     bag = write_run(tmp_path / "bag", image, track, datum=DATUM)
-    assert check_bag(bag).ok
+    report = check_bag(bag)
+    assert report.ok
+    assert f"{DATUM}" in {f.problem for f in report.findings if f.topic == "/csas/origin"}
     run = read_run(bag)
     assert (run.frame, run.datum) == ("auv/scene", DATUM)
     assert "origin at 48.0000000° N 4.5000000° W" in repr(run)
@@ -55,6 +57,27 @@ def test_a_run_that_mixes_two_frames_is_refused_by_both_names(tmp_path: Path, ti
         reconstruct_run(read_run(bag), COARSE)
     with pytest.raises(GeometryError, match="the track is in frame 'map'; expected that of the image"):
         SubApertures(made.image, in_frame(made.track, "map"))
+
+
+def test_views_in_another_frame_than_their_track_are_refused_by_both_names(
+    tmp_path: Path, tiny_box_bag
+) -> None:
+    made = tiny_box_bag.run
+    views = SubApertures(made.image, made.track, COARSE.sub_aperture)
+    messages = [
+        (f"sub_aperture/{part}", message)
+        for aspect in (0.0, 1.0)
+        for part, message in zip(
+            ("image", "camera_info"),
+            view_to_msgs(RosbagsMessages(), views.view_of_aspect(aspect), "sub_aperture"),
+            strict=True,
+        )
+    ]
+    bag = write_run(tmp_path / "bag", None, in_frame(made.track, "map"), extra=messages)
+    wrong = "the view is in frame 'csas_scene', the track in 'map'"
+    assert wrong in {f.problem for f in check_bag(bag).findings if f.level == "error"}
+    with pytest.raises(BagError, match="is in frame 'csas_scene'; expected that of the run, 'map'"):
+        reconstruct_run(read_run(bag), COARSE)
 
 
 def test_views_of_another_frame_than_the_run_or_its_target_are_refused(tiny_box_bag) -> None:
@@ -96,6 +119,9 @@ def test_an_origin_of_another_frame_gives_no_place_and_is_named(tmp_path: Path, 
     assert [p.reason for p in run.problems] == [
         "origin.header.frame_id is 'gps'; expected the run's, 'csas_scene': it gives no place"
     ]
+    report = check_bag(bag)
+    assert report.ok
+    assert [f.level for f in report.findings if f.topic == "/csas/origin"] == ["warning"]
 
 
 def test_a_heading_that_is_given_turns_the_bags_origin(tmp_path: Path, tiny_box_bag, capsys) -> None:
