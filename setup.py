@@ -56,6 +56,10 @@ TEST += ["playwright>=1.49,<2"]
 # Results as labelled arrays.
 XARRAY = ["xarray>=2023.1"]
 TEST += XARRAY
+# Archives: Parquet tables, questions to them in SQL, and clusters that process bags.
+ARCHIVE = ["pyarrow>=15", "duckdb>=1.1"]
+CLUSTER = ["distributed>=2024.1"]
+TEST += ARCHIVE + CLUSTER
 # The benchmark compares with the fastest FFT library that can be had: a floor to measure against.
 BENCH = ["pyfftw>=0.14"]
 # setuptools 80 dropped what colcon's --symlink-install calls.
@@ -137,6 +141,8 @@ setup(
     extras_require={
         "ros": ROS,
         "xarray": XARRAY,
+        "archive": ARCHIVE,
+        "cluster": ARCHIVE + CLUSTER,
         "test": TEST,
         "bench": BENCH,
         "build": BUILD,

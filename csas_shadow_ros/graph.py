@@ -47,7 +47,7 @@ _START_ORDER = (
     "viewer",
 )
 #: Each process has its own numerical libraries: as many threads in each as there are cores would only wait.
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+THREADS_OF_LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 #: What a node that is started again is told besides: the recording is there, and to be gone on with.
 _AGAIN = {"bag_recorder": "resume:=true"}
 #: A fork server that is told to end gets so long, and one that is asked for a node so long: what it loads may
@@ -251,7 +251,7 @@ def graph_environment(domain_id: int, log_dir: Path, graph_id: str = "") -> dict
     root = str(Path(__file__).resolve().parents[1])
     path = os.environ.get("PYTHONPATH", "")
     own["PYTHONPATH"] = f"{root}{os.pathsep}{path}" if path else root
-    defaults = {**_MEMORY, **dict.fromkeys(_THREADS, "1")}
+    defaults = {**_MEMORY, **dict.fromkeys(THREADS_OF_LIBRARIES, "1")}
     return {**defaults, **os.environ, **own}
 
 
