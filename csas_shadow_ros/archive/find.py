@@ -18,6 +18,8 @@ _EARTH_M = 6_371_000.0
 #: 95 % intervals are compared as they stand. Where a result gives none for its position, it is taken to be so
 #: wide (m): the length of a small mine.
 _UNKNOWN_HALF_M = 1.0
+#: Strips of latitude (m) in which objects are looked for that may be one: a few times an object's length.
+_STRIP_M = 20.0
 #: Interval columns that must overlap if two objects are to be one.
 _COMPARED = (
     ("length_low_m", "length_high_m"),
@@ -126,12 +128,20 @@ class Found:
                     / ({per_degree} * greatest(cos(radians(latitude_deg)), 1e-6)) AS east_deg
             FROM candidates"""
         )
+        # Only what lies in a common strip of latitude is compared: no table of all with all.
+        self._db.execute(
+            f"""CREATE OR REPLACE TEMP TABLE strips AS
+            SELECT id, unnest(range(
+                floor((latitude_deg - north_deg) * {per_degree / _STRIP_M})::BIGINT,
+                floor((latitude_deg + north_deg) * {per_degree / _STRIP_M})::BIGINT + 1)) AS strip
+            FROM boxes"""
+        )
         pairs = self._db.execute(
-            f"""SELECT a.id, b.id FROM boxes a JOIN boxes b
-                ON a.latitude_deg - a.north_deg <= b.latitude_deg + b.north_deg
-                AND b.latitude_deg - b.north_deg <= a.latitude_deg + a.north_deg
+            f"""SELECT DISTINCT a.id, b.id FROM strips s JOIN strips t USING (strip)
+                JOIN boxes a ON a.id = s.id JOIN boxes b ON b.id = t.id
+                WHERE s.id < t.id AND abs(a.latitude_deg - b.latitude_deg) <= a.north_deg + b.north_deg
                 AND abs((a.longitude_deg - b.longitude_deg + 540) % 360 - 180) <= a.east_deg + b.east_deg
-                AND a.id < b.id AND (a.task, a.number) <> (b.task, b.number) AND {overlap}"""
+                AND (a.task, a.number) <> (b.task, b.number) AND {overlap}"""
         ).fetchall()
         count = self._db.execute("SELECT count(*) FROM boxes").fetchone()[0]
         linked = sorted({number for pair in pairs for number in pair})

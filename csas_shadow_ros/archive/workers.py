@@ -241,6 +241,8 @@ class ClusterWorkers:
                 f"scheduler {self._where} does not answer ({' '.join(str(error).split())[:120]})"
             ) from error
         self._pool = self._client.get_executor(pure=False)
+        with contextlib.suppress(TimeoutError):  # a cluster may begin them when there is something to do
+            self._client.wait_for_workers(1, timeout=_PATIENCE_S)
 
     @property
     def window(self) -> int:

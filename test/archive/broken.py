@@ -1,4 +1,4 @@
-"""Tiny runs of an archive's tests: sound ones that are all different, and ones that are broken in many ways."""
+"""Tiny runs for archives: sound ones that are all different, and ones that are broken in many ways."""
 
 from __future__ import annotations
 

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -18,13 +17,14 @@ pytest.importorskip("pyarrow", reason="extra archive is not installed")
 pytest.importorskip("duckdb", reason="extra archive is not installed")
 
 from broken import KINDS, broken, sound
+from watching import children_of, done, wait_until
 
 import csas_shadow_ros
 from csas_shadow_ros import parameters
 from csas_shadow_ros.archive.batch import run_batch
 from csas_shadow_ros.archive.catalogue import rebuild
 from csas_shadow_ros.archive.find import Found
-from csas_shadow_ros.archive.layout import Archive, ArchiveError, Record
+from csas_shadow_ros.archive.layout import Archive, ArchiveError
 from csas_shadow_ros.archive.sources import bags_of
 from csas_shadow_ros.archive.task import Options, Task, WorkerError, process
 from csas_shadow_ros.archive.workers import LocalWorkers, WorkerDiedError
@@ -91,36 +91,6 @@ def failing(tiny_box_bag, tmp_path):
     return folder
 
 
-def children_of(pid: int) -> list[int]:
-    """Return the worker processes of a batch."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-            command = (folder / "cmdline").read_bytes()
-        except (OSError, ValueError):
-            continue
-        if parent == pid and b"spawn_main" in command:
-            found.append(int(folder.name))
-    return found
-
-
-def wait_until(true, what: str, seconds: float = 120.0) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end, f"{what}: not within {seconds:g} s"
-        time.sleep(0.02)
-
-
-def done(archive: Path) -> dict[str, int]:
-    """Return the results folders that are in place, and which inodes they are: another one is another result."""
-    return {
-        str(path): path.stat().st_ino
-        for path in archive.glob("runs/*/*/results")
-        if (record := Record.read(path.parent)) is not None and not record.failed
-    }
-
-
 def start(season: Path, archive: Path) -> subprocess.Popen:
     command = [sys.executable, "-m", "csas_shadow_ros", "batch", season, "--out", archive, "--workers", "2"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -166,6 +136,39 @@ def test_a_killed_worker_and_a_killed_batch_cost_only_what_was_in_flight(season,
     told = Found(archive).rows()
     assert rebuild(archive) == 5
     assert Found(archive).rows() == told
+
+
+@pytest.mark.long
+def test_a_hundred_runs_are_a_hundred_rows_whatever_is_killed(tiny_box_bag, tmp_path):
+    season, out = tmp_path / "bags", tmp_path / "a"
+    right = {sound(tiny_box_bag.run, season / f"run_{n}", n).name for n in range(90)}
+    wrong = {broken(tiny_box_bag.run, season / kind, kind, 90 + n).name for n, kind in enumerate(KINDS)}
+    first = start(season, out)
+    wait_until(lambda: len(done(out)) >= 5, "five results")
+    for number in (10, 20):  # not the same twice: a task has one retry
+        os.kill(children_of(first.pid)[0], signal.SIGKILL)
+        wait_until(lambda n=number: len(done(out)) >= n, f"{number} results")
+    first.kill()
+    assert first.communicate()[1].count("warning: a worker died at") == 2
+    before = done(out)
+    second = start(season, out)
+    wait_until(lambda: len(done(out)) >= len(before) + 10, "ten more")
+    second.send_signal(signal.SIGINT)  # in order: what is in flight is finished
+    said = second.communicate()[1]
+    assert (second.returncode, said.splitlines()[-1]) == (1, "csas-shadow: error: interrupted")
+    before |= done(out)
+    assert len(rows_by_name(out)) >= len(before)
+    third = start(season, out)
+    third.communicate()
+    assert third.returncode == 3
+    assert before.items() <= done(out).items()
+    rows = rows_by_name(out)
+    assert {name for name, row in rows.items() if row["verdict"] == "object"} == right
+    assert len({rows[name]["run_ns"] for name in right}) == 90
+    assert len({rows[name]["length_m"] for name in right}) == 1
+    assert {name for name, row in rows.items() if row["status"] == "failed"} == wrong
+    assert len({rows[name]["reason"].replace(name, "") for name in wrong}) == len(KINDS)
+    assert len((out / "failed.txt").read_text().splitlines()) == len(KINDS)
 
 
 def test_a_worker_that_dies_costs_its_task_one_retry(failing, tmp_path):

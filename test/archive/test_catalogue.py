@@ -221,7 +221,7 @@ def test_where_takes_sql_over_the_columns_and_nothing_else(tmp_path):
             Found(folder).where(bad)
     secret = tmp_path / "secret.csv"
     secret.write_text("a\n1\n")
-    with pytest.raises(QueryError, match="(?i)disabled|permission"):
+    with pytest.raises(QueryError, match=r"(?i)disabled|permission"):
         Found(folder).where(f"exists (select * from read_csv('{secret}'))")
 
 
