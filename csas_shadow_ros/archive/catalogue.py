@@ -41,7 +41,7 @@ _MERGE_SHARE, _MERGE_ROWS = 0.1, 1000
 #: Rows of a row group: what a reader takes into memory at once.
 _GROUP = 10_000
 #: Memory (bytes) of the merge; beyond it, it goes to the disk.
-_MERGE_MEMORY = "512MB"
+_MERGE_MEMORY = "256MB"
 
 
 def _arrow() -> tuple[Any, Any]:

@@ -22,7 +22,7 @@ def children_of(pid: int) -> list[int]:
     return found
 
 
-def wait_until(true, what: str, seconds: float = 120.0) -> None:
+def wait_until(true, what: str, seconds: float = 600.0) -> None:
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, f"{what}: not within {seconds:g} s"
