@@ -307,9 +307,9 @@ class _Batch:
                 try:
                     reply = workers.result(future)
                 except WorkerDiedError as error:
-                    if not tried:
+                    if not tried or not error.at_task:
                         self.notice(f"warning: a worker died at {task.bag}: it is tried once more")
-                        waiting.append((task, 1))
+                        waiting.append((task, tried + error.at_task))
                         continue
                     reply = give_up(task, f"{error} twice: killed, or out of the machine's memory")
                 self._take(reply, course)

@@ -190,6 +190,8 @@ class Catalogue:
         for table in TABLES:  # a first table has its columns even if nothing is in it
             (self.archive.parts / table.partition(".")[0]).mkdir(parents=True, exist_ok=True)
         there = not anew and all(path.exists() for path in mains.values())
+        if there and not parts:
+            return self._count(mains[RUNS])
         place, total = Place(self.archive.catalogue), 0
         place.clear(lambda _: None)
         work = place.make()

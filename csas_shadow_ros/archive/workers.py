@@ -8,6 +8,7 @@ import os
 import resource
 import signal
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -26,6 +27,10 @@ T = TypeVar("T")
 _SHARE = 0.8
 #: A worker that processes the smallest image takes so much (bytes); less is a slip.
 _LEAST_MEMORY = 500_000_000
+#: One that is killed as it starts is started again; so many in a row will not come up.
+_MOST_STARTS = 3
+#: How often (s) a cluster is asked for its workers.
+_ASK_S = 2.0
 #: A scheduler that does not answer in so many seconds is not there.
 _PATIENCE_S = 20.0
 
@@ -35,7 +40,19 @@ class WorkersError(CsasError):
 
 
 class WorkerDiedError(CsasError):
-    """The process that did a task is gone."""
+    """The process that did a task is gone.
+
+    Parameters
+    ----------
+    text : str
+        What happened.
+    at_task : bool
+        Whether the task may be the cause: not where the process had not even started.
+    """
+
+    def __init__(self, text: str, *, at_task: bool = True) -> None:
+        super().__init__(text)
+        self.at_task = at_task
 
 
 class Workers(Protocol):
@@ -88,7 +105,9 @@ def _begin(memory: int, threads: int) -> None:
     """Prepare a worker: bounded memory, no Ctrl-C of its own, and an end when the batch is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the batch decides what becomes of the tasks
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
+    _, most = resource.getrlimit(resource.RLIMIT_DATA)
+    bound = memory if most == resource.RLIM_INFINITY else min(memory, most)
+    resource.setrlimit(resource.RLIMIT_DATA, (bound, most))
     parent = multiprocessing.parent_process()
 
     def follow() -> None:
@@ -105,7 +124,8 @@ class _Slot:
     def __init__(self, begin: tuple[int, int]) -> None:
         self._begin = begin
         self._pool: ProcessPoolExecutor | None = None
-        self._process: Future[int] | None = None
+        #: Its number, once it has started.
+        self.process: Future[int] | None = None
 
     def submit(self, function: Callable[..., T], *arguments: Any) -> Future[T]:
         if self._pool is not None:
@@ -119,13 +139,13 @@ class _Slot:
         names = dict.fromkeys(THREADS_OF_LIBRARIES, str(self._begin[1]))
         with environment_of(names):
             self._pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=self._begin)
-            self._process = self._pool.submit(os.getpid)
+            self.process = self._pool.submit(os.getpid)
         return self._pool.submit(function, *arguments)
 
     def end(self, *, now: bool) -> None:
         if self._pool is None:
             return
-        process = self._process
+        process = self.process
         if now and process is not None and process.done() and process.exception() is None:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process.result(), signal.SIGKILL)
@@ -165,6 +185,8 @@ class LocalWorkers(Executor):
                 f"a worker's memory is {self.memory / 1e9:.2f} GB; expected {_LEAST_MEMORY / 1e9:g} or more"
             )
         self._idle: SimpleQueue[_Slot] = SimpleQueue()
+        self._process_of: dict[Future[Any], Future[int] | None] = {}
+        self._never_started = 0
         self._slots = [_Slot((self.memory, self.threads)) for _ in range(count)]
         for slot in self._slots:
             self._idle.put(slot)
@@ -187,15 +209,24 @@ class LocalWorkers(Executor):
         except BaseException:
             self._idle.put(slot)
             raise
+        self._process_of[future] = slot.process
         future.add_done_callback(lambda _: self._idle.put(slot))
         return future
 
     def result(self, future: Future[T]) -> T:
         """Return what came of a task; see `Workers.result`."""
+        process = self._process_of.pop(future, None)
         try:
-            return future.result()
+            value = future.result()
         except BrokenProcessPool as error:
-            raise WorkerDiedError("its worker died") from error
+            if process is not None and process.done() and process.exception() is None:
+                raise WorkerDiedError("its worker died") from error
+            self._never_started += 1
+            if self._never_started >= _MOST_STARTS:
+                raise WorkersError(f"{_MOST_STARTS} workers in a row died before they had started") from error
+            raise WorkerDiedError("its worker did not start", at_task=False) from error
+        self._never_started = 0
+        return value
 
     def end(self, *, now: bool) -> None:
         """End the processes."""
@@ -241,13 +272,18 @@ class ClusterWorkers:
                 f"scheduler {self._where} does not answer ({' '.join(str(error).split())[:120]})"
             ) from error
         self._pool = self._client.get_executor(pure=False)
+        self._window, self._asked = 2, 0.0
         with contextlib.suppress(TimeoutError):  # a cluster may begin them when there is something to do
             self._client.wait_for_workers(1, timeout=_PATIENCE_S)
 
     @property
     def window(self) -> int:
         """Tasks that are given out at once: two a thread, so that none waits for the next; it may grow."""
-        return 2 * max(1, sum(self._client.nthreads().values()))
+        if time.monotonic() - self._asked > _ASK_S:
+            with contextlib.suppress(Exception):  # that it is gone is told by the tasks
+                self._window = 2 * max(1, sum(self._client.nthreads().values()))
+            self._asked = time.monotonic()
+        return self._window
 
     def __str__(self) -> str:
         workers = self._client.nthreads()
@@ -266,6 +302,8 @@ class ClusterWorkers:
         if future.cancelled():
             raise self._gone()
         error = future.exception()
+        if error is not None and self._client.status != "running":
+            raise self._gone() from error
         if isinstance(error, self._library.KilledWorker):
             raise WorkerDiedError("its worker died, and so did others that took it over") from error
         return future.result()

@@ -27,7 +27,7 @@ from csas_shadow_ros.archive.find import Found
 from csas_shadow_ros.archive.layout import Archive, ArchiveError
 from csas_shadow_ros.archive.sources import bags_of
 from csas_shadow_ros.archive.task import Options, Task, WorkerError, process
-from csas_shadow_ros.archive.workers import LocalWorkers, WorkerDiedError
+from csas_shadow_ros.archive.workers import LocalWorkers, WorkerDiedError, WorkersError
 from csas_shadow_ros.cli import main
 from csas_shadow_ros.core.errors import ParameterError
 
@@ -303,6 +303,14 @@ def test_a_worker_takes_no_more_memory_and_threads_than_it_may():
         LocalWorkers(1, memory_gb=0.1)
     with pytest.raises(ParameterError, match="workers is 0; expected 1 to 1024"):
         LocalWorkers(0)
+
+
+def test_workers_that_do_not_start_end_the_batch_and_fail_no_bag(failing, tmp_path, monkeypatch):
+    # As in a program without `if __name__ == "__main__"`: what a worker imports first ends it.
+    monkeypatch.setattr("csas_shadow_ros.archive.workers._begin", os.abort)
+    with pytest.raises(WorkersError, match="3 workers in a row died before they had started"):
+        run_batch([failing], tmp_path / "a", lambda: LocalWorkers(1), OPTIONS)
+    assert not list((tmp_path / "a").rglob("task.json"))
 
 
 def test_sources_are_bags_folders_patterns_and_lists(failing, tmp_path, monkeypatch):
