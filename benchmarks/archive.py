@@ -2,7 +2,9 @@
 
 ``python benchmarks/archive.py runs --counts 25 50 100`` processes that many tiny runs, a tenth of them
 broken, on two workers; ``python benchmarks/archive.py rows --counts 1000 10000 100000`` fills catalogues with
-rows of made-up runs. Both need the extra ``archive``. Figures of one machine are in docs/archive.md.
+rows of made-up runs. ``python benchmarks/archive.py course --counts 250 1000 4000`` has that many bags fail
+at once, which shows what the batch itself takes. All need the extra ``archive``; figures are in
+docs/archive.md.
 """
 
 from __future__ import annotations
@@ -97,6 +99,25 @@ def runs(counts: list[int]) -> None:
         print(f"\nserial: {one:.2f} s of processor time a run; load {os.getloadavg()[0]:.1f}")
 
 
+def course(counts: list[int]) -> None:
+    """Print a line a number of bags that hold no recording: they cost their way through the batch alone."""
+    print("| bags | wall | a bag | batch process |\n|---|---|---|---|", flush=True)
+    with tempfile.TemporaryDirectory() as place:
+        for count in counts:
+            folder = Path(place) / f"bags_{count}"
+            folder.mkdir()
+            for number in range(count):
+                (folder / f"{number:06d}.mcap").write_text(f"no recording, number {number}")
+            said = batch(folder, Path(place) / f"archive_{count}", 2)
+            assert said["failed"] == said["runs"] == count, said
+            each = 1e3 * said["seconds"] / count
+            print(
+                f"| {count} | {said['seconds']:.0f} s | {each:.1f} ms | {said['memory_mb']:.0f} MB |",
+                flush=True,
+            )
+    print(f"\nload {os.getloadavg()[0]:.1f}")
+
+
 def made_up(number: int, rng: random.Random) -> object:
     """Return rows as long as real ones."""
     from csas_shadow_ros.archive.rows import CONTACT_COLUMNS, RUN_COLUMNS, Rows
@@ -170,13 +191,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("runs", "rows", "rows-once"))
+    parser.add_argument("what", choices=("runs", "rows", "rows-once", "course"))
     parser.add_argument("--counts", type=int, nargs="+", required=True)
     arguments = parser.parse_args()
     if arguments.what == "rows-once":
         rows_once(arguments.counts[0])
     else:
-        {"runs": runs, "rows": rows}[arguments.what](arguments.counts)
+        {"runs": runs, "rows": rows, "course": course}[arguments.what](arguments.counts)
 
 
 if __name__ == "__main__":
