@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import CsasError
+from ..core.geometry import Datum
 from ..results import read_report
 from ..results.folder import REPORT
 from .layout import COPY, DONE, FAILED_STATUS, PartOfTask, Record, brief
@@ -99,8 +100,6 @@ CONTACT_COLUMNS: dict[str, str] = {
     "results": "text",
     "finished": "time",
 }
-#: Of the WGS 84 ellipsoid: half the long axis (m) and the squared eccentricity.
-_AXIS_M, _E2 = 6378137.0, 6.69437999014e-3
 
 
 @dataclass
@@ -195,7 +194,7 @@ def _rows_of_report(
     run_ns = report.get("run")
     track = given.get("track") or {}
     truth = report.get("truth") or {}
-    origin = origin_of(report)
+    datum = datum_of(report)
     row = {
         **base,
         "run_ns": run_ns,
@@ -208,9 +207,9 @@ def _rows_of_report(
         "explained": quality.get("explained"),
         "objects": len(report["objects"]),
         "objects_left_out": len(report.get("objects_left_out", ())),
-        "origin_latitude_deg": origin.get("latitude_deg"),
-        "origin_longitude_deg": origin.get("longitude_deg"),
-        "origin_heading_deg": origin.get("heading_deg"),
+        "origin_latitude_deg": None if datum is None else datum.latitude_deg,
+        "origin_longitude_deg": None if datum is None else datum.longitude_deg,
+        "origin_heading_deg": None if datum is None else datum.heading_deg,
         "arc_deg": report.get("arc_deg"),
         "duration_s": track.get("duration_s"),
         "views_in": views["in"],
@@ -234,12 +233,10 @@ def _rows_of_report(
     row["bag"] = row["bag"] or str(given.get("path", ""))
     row["name"] = row["name"] or Path(row["bag"]).name
     shared = {name: row[name] for name in CONTACT_COLUMNS if name in row and name != "views_used"}
-    return row, [_contact(entry, shared, origin) for entry in report["objects"]]
+    return row, [_contact(entry, shared, datum) for entry in report["objects"]]
 
 
-def _contact(
-    entry: Mapping[str, Any], shared: Mapping[str, Any], origin: Mapping[str, float]
-) -> dict[str, Any]:
+def _contact(entry: Mapping[str, Any], shared: Mapping[str, Any], datum: Datum | None) -> dict[str, Any]:
     dimensions = entry["dimensions"]
     x, y = entry["position_m"][:2]
     values = {**dimensions, "position_x_m": x, "position_y_m": y}
@@ -249,16 +246,14 @@ def _contact(
         lower, upper = _bounds(column)
         for key, value in ((column, values.get(name)), (lower, low), (upper, high)):
             contact[key] = None if value is None else value * factor
-    contact |= place_of(entry, x, y, dimensions["heading_rad"], origin)
-    contact["east_half_m"], contact["north_half_m"] = _half_widths(contact, origin)
+    contact |= place_of(entry, datum)
+    contact["east_half_m"], contact["north_half_m"] = _half_widths(contact, datum)
     contact["views_used"] = entry.get("views_used")
     contact["mesh"] = f"{shared['results']}/{entry['files'][-1]}"
     return contact
 
 
-def _half_widths(
-    contact: Mapping[str, Any], origin: Mapping[str, float]
-) -> tuple[float | None, float | None]:
+def _half_widths(contact: Mapping[str, Any], datum: Datum | None) -> tuple[float | None, float | None]:
     """Return how far east and north of its position an object may lie (95 %), in the scene's place."""
     halves = []
     for name in ("x_m", "y_m"):
@@ -266,76 +261,28 @@ def _half_widths(
         if low is None or high is None:
             return None, None
         halves.append((high - low) / 2.0)
-    turn = math.radians(origin.get("heading_deg") or 0.0)
+    turn = 0.0 if datum is None else math.radians(datum.heading_deg)
     c, s = abs(math.cos(turn)), abs(math.sin(turn))
     return c * halves[0] + s * halves[1], s * halves[0] + c * halves[1]
 
 
-def origin_of(report: Mapping[str, Any]) -> dict[str, float]:
-    """Return where the scene's origin is on the earth; empty where the report does not say.
+def datum_of(report: Mapping[str, Any]) -> Datum | None:
+    """Return where on earth the scene of a report is; None where it does not say."""
+    told = report.get("datum")
+    if not told:
+        return None
+    covariance = told.get("covariance_m2")
+    return Datum(**{**told, "covariance_m2": None if covariance is None else tuple(covariance)})
 
-    `latitude_deg`, `longitude_deg`, `heading_deg` (of the scene's y axis, clockwise from true north) and
-    `sigma_m` of the position.
-    """
-    told = report.get("origin") or {}
-    latitude: Any = told.get("latitude_deg")
-    longitude: Any = told.get("longitude_deg")
-    if not _is_place(latitude, longitude):
-        return {}
-    found: dict[str, float] = {
-        "latitude_deg": latitude,
-        "longitude_deg": longitude,
-        "heading_deg": told.get("heading_deg") or 0.0,
+
+def place_of(entry: Mapping[str, Any], datum: Datum | None) -> dict[str, float | None]:
+    """Return an object's latitude, longitude and true bearing, and how sure its scene's place is (1σ, m)."""
+    told = entry.get("place") or {}
+    covariance = None if datum is None else datum.covariance_m2
+    return {
+        "position_sigma_m": None if covariance is None else math.sqrt(max(covariance[:2])),
+        **{name: told.get(name) for name in ("latitude_deg", "longitude_deg", "bearing_deg")},
     }
-    if told.get("sigma_m") is not None:
-        found["sigma_m"] = told["sigma_m"]
-    return found
-
-
-def place_of(
-    entry: Mapping[str, Any], x_m: float, y_m: float, heading_rad: float, origin: Mapping[str, float]
-) -> dict[str, float | None]:
-    """Return an object's latitude, longitude and true bearing: as reported, else by the scene's origin."""
-    place: dict[str, float | None] = {"position_sigma_m": origin.get("sigma_m")}
-    latitude, longitude = entry.get("latitude_deg"), entry.get("longitude_deg")
-    if not _is_place(latitude, longitude) and origin:
-        latitude, longitude = offset(
-            origin["latitude_deg"], origin["longitude_deg"], *_east_north(x_m, y_m, origin)
-        )
-    if not _is_place(latitude, longitude):
-        return place
-    bearing = entry.get("bearing_deg")
-    if bearing is None and origin:
-        # Of an axis, which has no front: 0 to 180 degrees.
-        bearing = (90.0 - math.degrees(heading_rad) + origin["heading_deg"]) % 180.0
-    return {**place, "latitude_deg": latitude, "longitude_deg": longitude, "bearing_deg": bearing}
-
-
-def _is_place(latitude: Any, longitude: Any) -> bool:
-    numbers = isinstance(latitude, int | float) and isinstance(longitude, int | float)
-    return numbers and abs(latitude) <= 90.0 and abs(longitude) <= 540.0
-
-
-def _east_north(x_m: float, y_m: float, origin: Mapping[str, float]) -> tuple[float, float]:
-    """Return a scene position as metres east and north: the y axis points at the heading, clockwise."""
-    turn = math.radians(origin["heading_deg"])
-    return x_m * math.cos(turn) + y_m * math.sin(turn), y_m * math.cos(turn) - x_m * math.sin(turn)
-
-
-def offset(latitude_deg: float, longitude_deg: float, east_m: float, north_m: float) -> tuple[float, float]:
-    """Return the place so far east and north of another, on the WGS 84 ellipsoid.
-
-    To second order in the distance: a millimetre at 1 km, away from the poles.
-    """
-    latitude = math.radians(latitude_deg)
-    across = _AXIS_M / math.sqrt(1.0 - _E2 * math.sin(latitude) ** 2)
-    along = across * (1.0 - _E2) / (1.0 - _E2 * math.sin(latitude) ** 2)
-    tangent = math.tan(latitude)
-    # The tangent plane's east is a great circle: it bends towards the equator.
-    north = north_m - east_m**2 * tangent / (2.0 * across)
-    east = east_m * (1.0 + north_m * tangent / across)
-    longitude = longitude_deg + math.degrees(east / (across * math.cos(latitude)))
-    return latitude_deg + math.degrees(north / along), (longitude + 180.0) % 360.0 - 180.0
 
 
 def _joined(lines: Iterable[str] | Sequence[str]) -> str:

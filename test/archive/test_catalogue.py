@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
-import math
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 pytest.importorskip("pyarrow", reason="extra archive is not installed")
@@ -20,36 +19,13 @@ from csas_shadow_ros.archive import catalogue as catalogue_module
 from csas_shadow_ros.archive.catalogue import Catalogue, rebuild
 from csas_shadow_ros.archive.find import Found, QueryError, table_of
 from csas_shadow_ros.archive.layout import Archive, ArchiveError
-from csas_shadow_ros.archive.rows import CONTACT_COLUMNS, RUN_COLUMNS, Rows, offset
+from csas_shadow_ros.archive.rows import CONTACT_COLUMNS, RUN_COLUMNS, Rows
 from csas_shadow_ros.cli import main
 from csas_shadow_ros.core.errors import ParameterError
+from csas_shadow_ros.core.geometry import Datum
 from csas_shadow_ros.results import read_report
 
-BREST = (48.36, -4.55)
-
-
-def ecef(latitude_deg: float, longitude_deg: float) -> np.ndarray:
-    """Return a place on the WGS 84 ellipsoid in earth-fixed metres, from its definition."""
-    axis, flat = 6378137.0, 1 / 298.257223563
-    e2 = flat * (2 - flat)
-    lat, lon = math.radians(latitude_deg), math.radians(longitude_deg)
-    across = axis / math.sqrt(1 - e2 * math.sin(lat) ** 2)
-    return np.array(
-        [
-            across * math.cos(lat) * math.cos(lon),
-            across * math.cos(lat) * math.sin(lon),
-            across * (1 - e2) * math.sin(lat),
-        ]
-    )
-
-
-def east_north(origin: tuple[float, float], place: tuple[float, float]) -> np.ndarray:
-    """Return a place in the tangent plane of another, metres east and north."""
-    lat, lon = map(math.radians, origin)
-    d = ecef(*place) - ecef(*origin)
-    east = np.array([-math.sin(lon), math.cos(lon), 0.0])
-    up = np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
-    return np.array([d @ east, d @ np.cross(up, east)])
+BREST = Datum(48.36, -4.55)
 
 
 @pytest.fixture(scope="module")
@@ -65,14 +41,19 @@ def with_origin(results: Path, to: Path, **origin: float) -> dict:
     """Copy a results folder, with a place of its scene's origin in the report."""
     shutil.copytree(results, to)
     report = read_report(to)
-    report["origin"] = origin
+    datum = Datum(**origin)
+    report["datum"] = dataclasses.asdict(datum)
+    for entry in report["objects"]:
+        latitude, longitude = datum.to_latlon(*entry["position_m"])
+        bearing = datum.bearing_deg(entry["dimensions"]["heading_rad"])
+        entry["place"] = {"latitude_deg": latitude, "longitude_deg": longitude, "bearing_deg": bearing}
     (to / "report.json").write_text(json.dumps(report))
     return report
 
 
 def contact(name: str, east_m: float, north_m: float, length_m: float = 1.0, **more) -> Rows:
     """Return rows of a run with one object, so far from Brest."""
-    latitude, longitude = offset(*BREST, east_m, north_m)
+    latitude, longitude = BREST.to_latlon(east_m, north_m)
     shared = {"task": name, "bag": name, "name": name, "number": 1, "finished": 1, "verdict": "object"}
     half = {"east_half_m": 0.1, "north_half_m": 0.1}
     sizes = {"length_m": length_m, "length_low_m": length_m - 0.1, "length_high_m": length_m + 0.1}
@@ -95,15 +76,6 @@ def archive_of(folder: Path, *rows: Rows) -> Path:
 
 def names(found: Found) -> list[str]:
     return [row["name"] for row in found.rows()]
-
-
-@pytest.mark.parametrize("latitude", [-71.0, 0.0, 48.36, 80.0])
-@pytest.mark.parametrize("offset_m", [(300.0, 400.0), (-1000.0, 20.0), (0.0, -800.0)])
-def test_an_offset_lands_within_5_cm_of_the_tangent_plane(latitude, offset_m):
-    place = offset(latitude, 179.999, *offset_m)
-    assert abs(place[1]) <= 180.0
-    # The plane leaves the ellipsoid: what is compared is seen from above.
-    assert np.abs(east_north((latitude, 179.999), place) - offset_m).max() < 0.05
 
 
 def test_rows_say_what_the_report_says(results):
@@ -130,24 +102,25 @@ def test_rows_say_what_the_report_says(results):
 
 def test_an_object_of_a_scene_with_a_place_has_one_too(results, tmp_path):
     report = with_origin(
-        results, tmp_path / "r", latitude_deg=BREST[0], longitude_deg=BREST[1], heading_deg=30.0
+        results,
+        tmp_path / "r",
+        latitude_deg=BREST.latitude_deg,
+        longitude_deg=BREST.longitude_deg,
+        heading_deg=30.0,
+        covariance_m2=(4.0, 1.0, 0.0),
     )
     rebuild(tmp_path)
     (row,) = Found(tmp_path).rows()
-    x, y = report["objects"][0]["position_m"]
-    turn = math.radians(30.0)
-    # The scene's y axis points 30 degrees east of north.
-    wanted = [x * math.cos(turn) + y * math.sin(turn), -x * math.sin(turn) + y * math.cos(turn)]
-    place = (row["latitude_deg"], row["longitude_deg"])
-    assert east_north(BREST, place) == pytest.approx(wanted, abs=0.001)
-    heading = report["objects"][0]["dimensions"]["heading_deg"]
-    assert row["bearing_deg"] == pytest.approx((90.0 - heading + 30.0) % 180.0)
+    for name, value in report["objects"][0]["place"].items():
+        assert row[name] == value
+    assert row["position_sigma_m"] == 2.0
+    assert row["east_half_m"] > 0.0
 
 
 def test_pandas_and_geopandas_read_the_tables_as_they_are(results, tmp_path):
     import pandas
 
-    with_origin(results, tmp_path / "r", latitude_deg=BREST[0], longitude_deg=BREST[1])
+    with_origin(results, tmp_path / "r", latitude_deg=BREST.latitude_deg, longitude_deg=BREST.longitude_deg)
     shutil.copytree(results, tmp_path / "nowhere")
     rebuild(tmp_path)
     runs = pandas.read_parquet(tmp_path / "catalogue" / "runs.parquet")
@@ -177,7 +150,7 @@ def test_a_task_whose_rows_come_again_has_them_once(tmp_path, monkeypatch):
         row["finished"] = 2
     folder = archive_of(tmp_path / "x", new, old, contact("b", 0, 0), new)
     assert names(Found(folder)) == ["a", "b"]
-    assert Found(folder).near(*offset(*BREST, 50, 0), 1.0).rows()[0]["name"] == "a"
+    assert Found(folder).near(*BREST.to_latlon(50, 0), 1.0).rows()[0]["name"] == "a"
     archive_of(folder, new, contact("c", 1, 1))
     assert names(Found(folder)) == ["a", "b", "c"]
 
@@ -227,9 +200,9 @@ def test_where_takes_sql_over_the_columns_and_nothing_else(tmp_path):
 
 def test_near_is_a_circle_on_the_earth_also_across_the_date_line(tmp_path):
     folder = archive_of(tmp_path / "x", contact("here", 3, 4), contact("there", 60, 80))
-    assert names(Found(folder).near(*BREST, 5.1)) == ["here"]
-    assert names(Found(folder).near(*BREST, 4.9)) == []
-    assert names(Found(folder).near(*BREST, 101)) == ["here", "there"]
+    assert names(Found(folder).near(BREST.latitude_deg, BREST.longitude_deg, 5.1)) == ["here"]
+    assert names(Found(folder).near(BREST.latitude_deg, BREST.longitude_deg, 4.9)) == []
+    assert names(Found(folder).near(BREST.latitude_deg, BREST.longitude_deg, 101)) == ["here", "there"]
     line = contact("line", 0, 0, latitude_deg=0.0, longitude_deg=-179.9999)
     other = archive_of(tmp_path / "y", line)
     assert names(Found(other).near(0.0, 179.9999, 30.0)) == ["line"]
