@@ -15,6 +15,8 @@ from pathlib import Path
 
 #: The list of a folder's files, as ``sha256sum -c`` reads it.
 CHECKSUMS = "SHA256SUMS"
+#: What people add to a folder later (`viewer.desk`): it has no checksum, and may change.
+BY_HAND = ("desk.json", ".desk.json.new")
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
 #: File systems and kernels without an exchange say one of these.
@@ -39,6 +41,40 @@ def sync_tree(folder: Path) -> None:
     for path in [*folder.rglob("*"), folder, folder.parent]:
         if not path.is_symlink() and (path.is_file() or path.is_dir()):
             sync(path)
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Put a file in place in one step: whoever is killed at any moment leaves the old one or the new.
+
+    One writer at a time: what is written first is called ``.NAME.new``, and taken over if it was left.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as place:
+    ...     write_whole(Path(place) / "note.txt", b"new")
+    ...     [(p.name, p.read_bytes()) for p in Path(place).iterdir()]
+    [('note.txt', b'new')]
+    """
+    new = path.with_name(f".{path.name}.new")
+    with new.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)
+    sync(path.parent)
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other processes that ask for it away from a folder; where there are no locks, nobody is kept."""
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):  # a network's file system may have none
+            fcntl.flock(number, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(number)
 
 
 def exchange(one: Path, other: Path) -> bool:
@@ -77,7 +113,7 @@ def write_checksums(folder: Path, known: dict[str, str]) -> None:
     names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
     lines = []
     for name in names:
-        if name != CHECKSUMS:
+        if name != CHECKSUMS and name not in BY_HAND:
             known[name] = known.get(name) or sha256(folder / name)
             lines.append(f"{known[name]}  {name}\n")
     (folder / CHECKSUMS).write_text("".join(lines), encoding="utf-8")

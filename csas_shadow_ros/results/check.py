@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
-from ..durable import CHECKSUMS, sha256
+from ..durable import BY_HAND, CHECKSUMS, sha256
 from .folder import GRID, REPORT
 from .report import FORMAT
 
@@ -155,7 +155,7 @@ def check_results(folder: str | Path) -> ResultsCheck:
                 check.files += 1
             else:
                 error(name, "has changed: its SHA-256 is another")
-    for name in sorted(set(there) - set(listed) - {CHECKSUMS}):
+    for name in sorted(set(there) - set(listed) - {CHECKSUMS, *BY_HAND}):
         error(name, "is not listed: it was not written with the results")
     if report is not None and isinstance(report.get("files"), list):
         for name in sorted({str(n) for n in report["files"]} - set(listed) - {CHECKSUMS}):

@@ -21,7 +21,7 @@ from ..core.mesh import Dimensions, measure, mesh_from_grid
 from ..core.pipeline import ProcessedView
 from ..core.shape.result import Result
 from ..core.volume import Volume, VoxelGrid
-from ..durable import CHECKSUMS, Place, write_checksums
+from ..durable import BY_HAND, CHECKSUMS, Place, write_checksums
 from .bag import ResultBag
 from .report import FORMAT, Context, build_report, complete_report, report_text, summary
 from .subject import Keeper, Subject
@@ -315,8 +315,8 @@ class ResultsWriter:
 
     def _commit(self, report: dict[str, Any], sums: dict[str, str], to_come: dict[str, str]) -> None:
         """Write the report, the table and the checksums, and put the folder in place."""
-        files = [p.relative_to(self._work).as_posix() for p in self._work.rglob("*") if p.is_file()]
-        report["files"] = sorted({*files, REPORT, SUMMARY, CHECKSUMS})
+        files = {p.relative_to(self._work).as_posix() for p in self._work.rglob("*") if p.is_file()}
+        report["files"] = sorted({*files, REPORT, SUMMARY, CHECKSUMS} - set(BY_HAND))
         report["failed"] = {**self.failed, **to_come}
         text = self.attempt(SUMMARY, lambda: summary(report), "")
         report["failed"] = {**self.failed, **to_come}
