@@ -1,4 +1,4 @@
-"""The command line: ``csas-shadow simulate | check | info | run | replay | batch | catalogue | find | …``."""
+"""The command line: ``csas-shadow simulate | check | info | run | replay | view | report | batch | …``."""
 
 from __future__ import annotations
 
@@ -294,6 +294,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_replay(add)
     _add_archive(add)
     _add_view(add)
+    _add_report(add)
     warm = add(
         "warm",
         "compile all kernels, which takes a minute, once for all users of this installation",
@@ -635,12 +636,16 @@ def _add_view(add: Callable[..., argparse.ArgumentParser]) -> None:
         "look at a results folder or a bag in a browser: circular sliders, layers, ruler, 3-D",
         "  csas-shadow view box_results\n"
         "  csas-shadow view box_results/result.mcap --no-browser --port 8765\n"
-        "  csas-shadow view box_results --html box.html --every 5\n\n"
+        "  csas-shadow view box_results --html box.html --every 5\n"
+        "  csas-shadow view monday_results friday_results\n\n"
         "ends with Ctrl-C. Listens on this machine alone unless --host says otherwise; the network is asked\n"
         "for the token that is then printed. For a live graph: ros2 run csas_shadow_ros viewer",
         _view,
     )
     p.add_argument("path", metavar="DIR|BAG", help="a results folder, or a bag that holds views")
+    p.add_argument(
+        "compare", nargs="?", metavar="OTHER", help="a second run of the same contact, to compare it with"
+    )
     p.add_argument("--namespace", help="namespace of the bag's topics (found by itself)")
     p.add_argument("--host", default="127.0.0.1", help="address to listen at (default 127.0.0.1)")
     p.add_argument("--port", type=int, default=0, metavar="N", help="port (default: any that is free)")
@@ -650,6 +655,23 @@ def _add_view(add: Callable[..., argparse.ArgumentParser]) -> None:
     p.add_argument(
         "--every", type=int, default=2, metavar="N", help="of that file: every N-th view (default 2)"
     )
+    p.add_argument("--gif", metavar="FILE", help="write the circle as a moving picture, and end")
+    _common(p)
+
+
+def _add_report(add: Callable[..., argparse.ArgumentParser]) -> None:
+    p = add(
+        "report",
+        "write one page on a contact: pictures, dimensions, position, judgement, damage",
+        "  csas-shadow report box_results\n"
+        "  csas-shadow report box_results --contact 2 --out second.html\n\n"
+        "A PDF or an HTML file, as the name ends. The judgement is what was kept in the viewer.",
+        _report,
+    )
+    p.add_argument("path", metavar="DIR|BAG", help="a results folder, or a bag that holds views")
+    p.add_argument("--namespace", help="namespace of the bag's topics (found by itself)")
+    p.add_argument("--out", metavar="FILE", help="file to write (default: NAME_report.pdf)")
+    p.add_argument("--contact", type=int, metavar="N", help="number of the contact (default: the first)")
     _common(p)
 
 
@@ -750,15 +772,51 @@ def _check(arguments: argparse.Namespace, console: Console) -> int:
     return OK if report.ok else FAILED
 
 
+def _save(
+    arguments: argparse.Namespace,
+    console: Console,
+    out: str,
+    make: Callable[[Any], bytes],
+    second: str | None = None,
+) -> int:
+    """Write a file of a run, and say what of the run it lacks."""
+    from .viewer import command
+
+    size, damage = command.save(out, make, arguments.path, arguments.namespace, second)
+    console.result(f"{out}: {_size(size)}", {"file": out, "bytes": size, "damage": damage})
+    for line in damage:
+        print(f"{PROGRAM}: error: {line}", file=sys.stderr)
+    return PARTIAL if damage else OK
+
+
+def _report(arguments: argparse.Namespace, console: Console) -> int:
+    from .viewer.contact_report import as_html, as_pdf, sheet_of
+
+    out = arguments.out or f"{Path(arguments.path).resolve().name}_report.pdf"
+    writers = {".pdf": as_pdf, ".html": as_html}
+    write = writers.get(Path(out).suffix.lower())
+    if write is None:
+        raise ParameterError(f"--out is {out!r}; expected a name that ends with .pdf or .html")
+    contact = "" if arguments.contact is None else f"object-{arguments.contact}"
+    return _save(arguments, console, out, lambda store: write(sheet_of(store, contact)))
+
+
 def _view(arguments: argparse.Namespace, console: Console) -> int:
     from .viewer import command
 
     if arguments.html is not None:
         if not 1 <= arguments.every <= 360:
             raise ParameterError(f"--every is {arguments.every}; expected 1 to 360")
-        size = command.save_html(arguments.path, arguments.html, arguments.every, arguments.namespace)
-        console.result(f"{arguments.html}: {_size(size)}", {"file": arguments.html, "bytes": size})
-        return OK
+        from .viewer.export import export_html
+
+        def page(store: Any) -> bytes:
+            return export_html(store, arguments.every)
+
+        return _save(arguments, console, arguments.html, page, arguments.compare)
+    if arguments.gif is not None:
+        from .viewer.crop import moving_picture
+
+        return _save(arguments, console, arguments.gif, moving_picture)
 
     def say(url: str) -> None:
         console.result(url, {"url": url})
@@ -766,6 +824,7 @@ def _view(arguments: argparse.Namespace, console: Console) -> int:
 
     command.view(
         arguments.path,
+        second=arguments.compare,
         namespace=arguments.namespace,
         host=arguments.host,
         port=arguments.port,

@@ -8,12 +8,14 @@ dropped, or sent before it was started), gets them by flow control, and says goo
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import queue
 import sys
 import threading
 import time
 from collections import deque
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -22,7 +24,9 @@ from rclpy.duration import Duration
 from csas_shadow_ros.bags.bag import BagMessage
 from csas_shadow_ros.core.errors import CsasError
 from csas_shadow_ros.core.parameters import CarvingParameters, SubApertureParameters
+from csas_shadow_ros.results.report import json_ready
 from csas_shadow_ros.viewer.codes import amplitude_codes
+from csas_shadow_ros.viewer.contacts import about, contacts_of
 from csas_shadow_ros.viewer.server import ViewerServer
 from csas_shadow_ros.viewer.source import Reduced, Shape, box_json, grid_of, spooled
 from csas_shadow_ros.viewer.store import Spool, ViewStore
@@ -52,6 +56,10 @@ _GROWING = ("multilook", "color_by_aspect", "voxel_grid", "voxel_views")
 _BATCH = 8
 #: Discovery takes a moment after the start and after leaving; so often a run's missing views are asked for.
 _SETTLE_S, _TRIES = 3.0, 3
+#: A graph whose source has been silent for so long is gone: six heartbeats, as of consumers (`nodes.rivals`).
+_SILENT_S = 3.0
+#: The rate of views is that of so long.
+_RATE_S = 5.0
 
 
 class CatchingUp(Inlet):
@@ -98,6 +106,11 @@ class ViewerNode(CsasNode):
         self._image: dict[str, bytes] = {}
         self._finished = False
         self._said_s = 0.0
+        #: When a source was heard last, and when the newest view came.
+        self._heard_s = self._newest_s = -math.inf
+        self._total = 0
+        #: When each of the last views came.
+        self._came: deque[float] = deque(maxlen=50)
         self._joined = ""
         self._tries: dict[tuple[str, int], int] = {}
         self._since_s = time.monotonic()
@@ -191,6 +204,25 @@ class ViewerNode(CsasNode):
         told = measurements_from_msg(msg)
         self._measured = True
         self.store.put_dimensions(told.objects[0].dimensions if told.objects else None)
+        report = {
+            "verdict": told.verdict,
+            "quality": {"verdict": told.quality.verdict, "reasons": list(told.quality.reasons)},
+            "views": {"used": told.views_used},
+            "objects": [
+                {
+                    "number": one.number,
+                    "position_m": one.dimensions.position_m,
+                    "dimensions": asdict(one.dimensions),
+                    "views_used": one.views_used,
+                    "files": ["grid.npz" if one.number == 1 else ""],
+                }
+                for one in told.objects
+            ],
+            "objects_left_out": [asdict(one) for one in told.left_out],
+        }
+        report = json_ready(report)
+        self.store.put_part("report", about(report))
+        self.store.put_part("contacts", contacts_of(report))
 
     def _take_image(self, topic: str, cdr: bytes) -> None:
         self._image[topic] = cdr
@@ -227,6 +259,9 @@ class ViewerNode(CsasNode):
             entry = spooled(self._spool, name, view_from_msgs(image, info, name))
             self._enter_run(entry.info.stamp_ns)
             self.store.put_view(name, entry)
+            if name == "shadow" or not self.store.sets["shadow"]:
+                self._newest_s = time.monotonic()
+                self._came.append(self._newest_s)
             self._shaped.clear()
             inlet = next((i for i in self.inlets if i.stream == name), None)
             if inlet is not None:
@@ -262,6 +297,7 @@ class ViewerNode(CsasNode):
         """Join when a source has finished and views are lacking; leave when they are here."""
         own = beat.values.get("stream", "")
         if own == "sector" or self.server is None:
+            self._heard_s = time.monotonic()
             return
         if self.inlets and beat.instance != self._joined:
             self._leave()  # another run has begun: whatever the last one lacked is not to be had any more
@@ -271,6 +307,7 @@ class ViewerNode(CsasNode):
                 self._leave()
             return
         finished, total = bool(beat.counts.get("finished")), beat.counts.get("total", 0)
+        self._heard_s, self._total = time.monotonic(), total
         if finished != self._finished:
             self._finished = finished
             self._shaped.clear()
@@ -318,6 +355,24 @@ class ViewerNode(CsasNode):
             self._said_s = now
             held = len(self.store.sets["shadow"]) or len(self.store.sets["sub_aperture"])
             self.store.put_part("status", f"{held} views, " + ("finished" if self._finished else "running"))
+            self.store.put_part("progress", self._progress(now, held))
+
+    def _progress(self, now: float, held: int) -> dict[str, Any]:
+        """Say how the run goes, as the page's badge tells it."""
+        silent = now - self._heard_s
+        state = "finished" if self._finished else "running"
+        if silent > _SILENT_S:
+            state = "silent" if math.isfinite(silent) else "waiting"
+        recent = [t for t in list(self._came) if now - t < _RATE_S]
+        span = now - recent[0] if recent else 0.0
+        return {
+            "state": state,
+            "views": held,
+            "of": self._total or None,
+            "rate": round(len(recent) / span, 1) if span > 0.5 else None,
+            "newest_s": round(now - self._newest_s) if held and math.isfinite(self._newest_s) else None,
+            "silent_s": round(silent) if state == "silent" else None,
+        }
 
 
 def main() -> int:

@@ -8,7 +8,7 @@ import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 
-from .export import export_html
+from .compare import Second
 from .server import ViewerServer
 from .source import PathSource
 from .store import ViewerError, ViewStore
@@ -17,6 +17,7 @@ from .store import ViewerError, ViewStore
 def view(
     path: str | Path,
     *,
+    second: str | Path | None = None,
     namespace: str | None = None,
     host: str = "127.0.0.1",
     port: int = 0,
@@ -24,7 +25,7 @@ def view(
     browser: bool = True,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Show a results folder or a bag until SIGINT or SIGTERM.
+    """Show a results folder or a bag until SIGINT or SIGTERM, with a `second` one to compare it with.
 
     Raises
     ------
@@ -36,26 +37,65 @@ def view(
         signal.signal(number, lambda *_: stop.set())
     store = ViewStore()
     source = PathSource(store, path, namespace)
+    other = None if second is None else Second(store, second, namespace)
     server = ViewerServer(store, host, port, token)
     server.start()
     say(server.url)
     source.start()
+    if other is not None:
+        other.start()
     if browser:
         webbrowser.open(server.url)
     stop.wait()
     server.stop()
 
 
-def save_html(path: str | Path, out: str | Path, step: int, namespace: str | None = None) -> int:
-    """Write the page of a results folder or a bag as one HTML file; return its size in bytes.
+def read_whole(
+    path: str | Path, namespace: str | None = None, second: str | Path | None = None
+) -> PathSource:
+    """Read a results folder or a bag to its end, and a second one to compare it with.
+
+    Raises
+    ------
+    ViewerError, BagError
+        If there is nothing to see, or what there is cannot be read.
+    """
+    store = ViewStore()
+    source = PathSource(store, path, namespace)
+    other = None if second is None else Second(store, second, namespace)
+    source.start()
+    source.done.wait()
+    if other is not None:
+        other.start()
+        other.done.wait()
+        source.problems += [f"{second}: {line}" for line in other.source.problems]
+    failed = source.failed or (other.source.failed if other is not None else "")
+    if failed:
+        raise ViewerError(failed)
+    return source
+
+
+def save(
+    out: str | Path,
+    make: Callable[[ViewStore], bytes],
+    path: str | Path,
+    namespace: str | None = None,
+    second: str | Path | None = None,
+) -> tuple[int, list[str]]:
+    """Make a file of a results folder or a bag: a page, a report or a moving picture.
+
+    Returns
+    -------
+    int
+        Its size in bytes.
+    list of str
+        What of the run could not be read, a line each.
 
     Raises
     ------
     ViewerError, BagError
         If there is nothing to see, what there is cannot be read, or the file cannot be written.
     """
-    store = ViewStore()
-    source = PathSource(store, path, namespace)
     file = Path(out)
     new = not file.exists()
     try:
@@ -64,10 +104,10 @@ def save_html(path: str | Path, out: str | Path, step: int, namespace: str | Non
             pass
     except OSError as error:
         raise ViewerError(f"cannot write {out}: {error.strerror}") from error
-    source.start()
-    source.done.wait()
-    if source.failed:
+    try:
+        source = read_whole(path, namespace, second)
+        return file.write_bytes(make(source.store)), source.problems
+    except BaseException:
         if new:
             file.unlink()
-        raise ViewerError(source.failed)
-    return file.write_bytes(export_html(store, step))
+        raise

@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 from .server import STATIC
-from .store import ViewStore
+from .store import SECOND, ViewStore
 
 _SHOWN = ("sub_aperture", "shadow", "likelihood")
 
@@ -32,15 +32,23 @@ def export_html(store: ViewStore, step: int = 1) -> bytes:
         about["views"] = sorted(about["views"], key=lambda v: v["aspect_deg"])[::step]
         for view in about["views"]:
             stamp, path = int(view["stamp"]), f"{view['stamp']}/{view['rev']}"
-            if name in _SHOWN:
+            plain = name.removeprefix(SECOND)
+            if plain in _SHOWN:
                 address = f"api/view/{name}/{path}.jpg"
                 files[address] = _data(store.view_picture(name, stamp, "jpg"), "image/jpeg")
-            elif name == "shadow_mask":
-                lines = json.dumps(store.contour(stamp)).encode()
-                files[f"api/contour/{path}.json"] = _data(lines, "application/json")
-        if name not in (*_SHOWN, "shadow_mask"):
+            elif plain == "shadow_mask":
+                lines = json.dumps(store.contour(stamp, name)).encode()
+                asked = "" if name == plain else f"?set={name}"
+                files[f"api/contour/{path}.json{asked}"] = _data(lines, "application/json")
+        if name.removeprefix(SECOND) not in (*_SHOWN, "shadow_mask"):
             about["views"] = []
+    if scene["live"]:
+        scene["damage"] = scene["damage"] or f"saved while the run went on: {scene['status']}"
     scene["reduced"], scene["live"] = False, False
+    if not scene["desk"]["why"]:
+        scene["desk"]["why"] = "this is a saved file: judge in the viewer of the run"
+    for name, about in scene["meshes"].items():
+        files[f"api/surface-of/{name}/{about['rev']}.json"] = _data(store.mesh(name), "application/json")
     for name, about in scene["pictures"].items():
         files[f"api/picture/{name}/{about['rev']}.png"] = _data(store.composite_picture(name), "image/png")
     for name, about in scene["volumes"].items():

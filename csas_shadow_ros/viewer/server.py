@@ -8,6 +8,7 @@ import hmac
 import ipaddress
 import json
 import math
+import re
 import secrets
 import socket
 import threading
@@ -32,6 +33,12 @@ _COOKIE = "csas_viewer_token_{}"
 #: Notices that wait for a slow page; beyond that it is cut off, comes back and gets everything anew.
 _QUEUE = 4096
 _MESHES = {"stl": "model/stl", "ply": "model/ply", "obj": "model/obj", "glb": "model/gltf-binary"}
+#: Whoever tries a token a millisecond finds one of 12 letters and digits in no lifetime (36^12 ms).
+_SHORTEST_TOKEN = 12
+#: Of a change: an operator's remark has 2000 letters.
+_MOST_POSTED = 1 << 18
+#: A run that is still being read is waited for so long before a file of it is made (s).
+_LOADS_S = 120.0
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; worker-src 'self' blob:;"
     " style-src 'self' 'unsafe-inline'; object-src 'none'; base-uri 'none'; frame-ancestors 'none'",
@@ -71,6 +78,10 @@ class ViewerServer:
     ) -> None:
         self.store = store
         self.host, self.port = host, port
+        if token is not None and len(token) < _SHORTEST_TOKEN:
+            raise ParameterError(
+                f"token has {len(token)} letters; expected {_SHORTEST_TOKEN} or more, or none"
+            )
         self.token = token or (None if is_loopback(host) else secrets.token_urlsafe(18))
         self._queues: set[asyncio.Queue[str | None]] = set()
         self._pool = ThreadPoolExecutor(2, thread_name_prefix="viewer")
@@ -147,19 +158,23 @@ class ViewerServer:
             await asyncio.sleep(0)
 
     def _app(self) -> web.Application:
-        app = web.Application(middlewares=[self._guard])
+        app = web.Application(middlewares=[self._guard], client_max_size=_MOST_POSTED)
         add = app.router.add_get
         add("/", self._page)
         add("/ws", self._socket)
         add("/api/scene", self._scene)
-        add("/api/view/{set}/{stamp:[0-9]+}/{rev}.{kind:jpg|png}", self._view)
-        add("/api/contour/{stamp:[0-9]+}/{rev}.json", self._contour)
+        add("/api/view/{set}/{stamp:[0-9]{1,20}}/{rev}.{kind:jpg|png}", self._view)
+        add("/api/contour/{stamp:[0-9]{1,20}}/{rev}.json", self._contour)
         add("/api/picture/{name}/{rev}.png", self._composite)
         add("/api/volume/{name}/{rev}.bin", self._volume)
         add("/api/surface/{name}.json", self._surface)
         add("/api/mesh/{name}.{kind:stl|ply|obj|glb}", self._mesh)
         add("/api/reduced", self._make_reduced)
         add("/api/export.html", self._export)
+        add("/api/circle.gif", self._circle)
+        add("/api/report.{kind:pdf|html}", self._report)
+        add("/api/surface-of/{name}/{rev}.json", self._other_surface)
+        app.router.add_post("/api/desk", self._judge)
         app.router.add_static("/static/", STATIC)
         return app
 
@@ -174,6 +189,14 @@ class ViewerServer:
         origin = request.headers.get("Origin")
         if origin is not None and origin.partition("://")[2] != request.host:
             raise web.HTTPForbidden(text="the viewer answers its own page alone")
+        # A link elsewhere may lead to the page; what a page elsewhere embeds or fetches may start no work.
+        if request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin") and not (
+            request.path == "/" and request.headers.get("Sec-Fetch-Dest") == "document"
+        ):
+            raise web.HTTPForbidden(text="the viewer answers its own page alone")
+        # Browsers always say where what they post comes from.
+        if request.method not in ("GET", "HEAD") and origin is None:
+            raise web.HTTPForbidden(text="the viewer takes changes from its own page alone")
         given = request.query.get("token") or request.cookies.get(_COOKIE.format(self.port)) or ""
         if self.token is not None and not hmac.compare_digest(given.encode(), self.token.encode()):
             raise web.HTTPUnauthorized(text="the viewer asks for its token: open the address that it printed")
@@ -214,7 +237,8 @@ class ViewerServer:
         return self._kept(body, "image/jpeg" if about["kind"] == "jpg" else "image/png")
 
     async def _contour(self, request: web.Request) -> web.StreamResponse:
-        lines = await self._in_thread(self.store.contour, int(request.match_info["stamp"]))
+        name = request.query.get("set", "shadow_mask")
+        lines = await self._in_thread(self.store.contour, int(request.match_info["stamp"]), name)
         return self._kept(json.dumps(lines).encode(), "application/json")
 
     async def _composite(self, request: web.Request) -> web.StreamResponse:
@@ -271,8 +295,7 @@ class ViewerServer:
             return data.encode() if isinstance(data, str) else bytes(data)
 
         body = await self._in_thread(work)
-        name = f"attachment; filename={request.match_info['name']}.{kind}"
-        return web.Response(body=body, content_type=_MESHES[kind], headers={"Content-Disposition": name})
+        return self._to_keep(body, _MESHES[kind], f"{request.match_info['name']}.{kind}")
 
     async def _make_reduced(self, _: web.Request) -> web.StreamResponse:
         def work() -> bool:
@@ -288,12 +311,72 @@ class ViewerServer:
     async def _export(self, request: web.Request) -> web.StreamResponse:
         from .export import export_html
 
-        step = request.query.get("step", "5")
-        if not step.isdigit() or not 1 <= int(step) <= 360:
-            raise ParameterError(f"step is {step!r}; expected every how manieth view, 1 to 360")
-        body = await self._in_thread(export_html, self.store, int(step))
-        name = "attachment; filename=csas_view.html"
-        return web.Response(body=body, content_type="text/html", headers={"Content-Disposition": name})
+        step = self._whole_number(request, "step", 5, 1, 360)
+
+        def work() -> bytes:
+            if not self.store.live and not self.store.loaded.wait(_LOADS_S):
+                raise ViewerError("the run is still being read; try again")
+            return export_html(self.store, step)
+
+        body = await self._in_thread(work)
+        return self._to_keep(body, "text/html", "view.html")
+
+    @staticmethod
+    def _whole_number(request: web.Request, name: str, otherwise: int, low: int, high: int) -> int:
+        text = request.query.get(name, str(otherwise))
+        # Not isdigit(): it takes signs that int() does not, such as ².
+        if not (text.isascii() and text.isdigit() and len(text) < 10 and low <= int(text) <= high):
+            raise ParameterError(f"{name} is {text[:40]!r}; expected a whole number, {low} to {high}")
+        return int(text)
+
+    def _to_keep(self, body: bytes, kind: str, name: str) -> web.Response:
+        """Answer a file to be saved, under the run's name."""
+        run = re.sub(r"[^A-Za-z0-9._-]+", "_", self.store.title) or "csas"
+        disposition = f'attachment; filename="{run}_{name}"'
+        return web.Response(body=body, content_type=kind, headers={"Content-Disposition": disposition})
+
+    async def _circle(self, request: web.Request) -> web.StreamResponse:
+        from .crop import moving_picture
+
+        name, contact = request.query.get("set", "shadow"), request.query.get("contact", "")
+        body = await self._in_thread(moving_picture, self.store, name, contact)
+        return self._to_keep(body, "image/gif", f"{contact or 'circle'}.gif")
+
+    async def _report(self, request: web.Request) -> web.StreamResponse:
+        from . import contact_report  # late: matplotlib takes half a second
+
+        contact, kind = request.query.get("contact", ""), request.match_info["kind"]
+
+        def work() -> bytes:
+            sheet = contact_report.sheet_of(self.store, contact)
+            return contact_report.as_pdf(sheet) if kind == "pdf" else contact_report.as_html(sheet)
+
+        body = await self._in_thread(work)
+        types = {"pdf": "application/pdf", "html": "text/html"}
+        return self._to_keep(body, types[kind], f"{contact or 'report'}.{kind}")
+
+    async def _other_surface(self, request: web.Request) -> web.StreamResponse:
+        return self._kept(self.store.mesh(request.match_info["name"]), "application/json")
+
+    async def _judge(self, request: web.Request) -> web.StreamResponse:
+        """Change what has been judged: the only thing that the page writes."""
+        if request.content_type != "application/json":
+            raise web.HTTPUnsupportedMediaType(text="expected application/json")
+        try:
+            changes = (await request.json())["items"]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            changes = None
+        if not isinstance(changes, list):
+            raise ParameterError("expected JSON with a list of items")
+        desk = self.store.desk
+        if desk is None:
+            raise web.HTTPConflict(text=self.store.scene()["desk"]["why"])
+        try:
+            document = await self._in_thread(desk.change, changes)
+        except ViewerError as error:
+            raise web.HTTPConflict(text=str(error)) from error
+        self.store.put_desk(document)
+        return web.json_response(document)
 
     # Notices
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from msg_adapters.camera_info import view_info_from_msg
@@ -36,12 +37,16 @@ from ..core.subaperture import SubApertures
 from ..core.threshold import thresholded
 from ..core.volume import Target, Volume, VoxelGrid
 from . import codes
+from .contacts import about, contacts_of
+from .desk import Desk
 from .store import Entry, Spool, ViewerError, ViewStore
 
 log = logging.getLogger(__name__)
 #: Width of the reduced sub-apertures of figure 5 (deg).
 REDUCED_DEG = 4.0
 RESULT_BAG = "result.mcap"
+#: A truth of more triangles is not shown over the object: it would weigh more than the views.
+_MOST_FACES = 50_000
 
 
 def codes_of(name: str, pixels: NDArray[Any]) -> NDArray[np.uint8]:
@@ -163,17 +168,27 @@ def grid_of(
 
 def grid_of_folder(folder: Path, method: str) -> VoxelGrid:
     """Read ``grid.npz``."""
-    path = folder / "grid.npz"
+    return grid_of_file(folder / "grid.npz", method)
+
+
+def grid_of_file(path: Path, method: str) -> VoxelGrid:
+    """Read a grid as a results folder holds it.
+
+    Raises
+    ------
+    ViewerError
+        If it is damaged: any part of it may be what a broken disk or a full one left.
+    """
     try:
-        data = np.load(path)
-    except (OSError, ValueError, EOFError) as error:
-        raise ViewerError(f"{path} cannot be read: {error}; make it again: csas-shadow run") from error
-    with data:
-        origin = tuple(float(v) for v in data["origin_m"])
-        likelihood = data["likelihood"]
-        volume = Volume((origin[0], origin[1], origin[2]), float(data["voxel_size_m"]), likelihood.shape)
-        threshold = float(data["threshold"])
-        return VoxelGrid(volume, likelihood, data["views"], threshold, data["occupied"], method)
+        with np.load(path) as data:
+            x, y, z = (float(v) for v in data["origin_m"])
+            likelihood = data["likelihood"]
+            volume = Volume((x, y, z), float(data["voxel_size_m"]), likelihood.shape)
+            threshold = float(data["threshold"])
+            return VoxelGrid(volume, likelihood, data["views"], threshold, data["occupied"], method)
+    except Exception as error:  # of zipfile, zlib, numpy and the grid's own: what was read is no grid
+        what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        raise ViewerError(f"{path} cannot be read: {what}; make it again: csas-shadow run") from error
 
 
 def box_json(box: TargetBox | None) -> dict[str, Any] | None:
@@ -200,16 +215,23 @@ class PathSource:
     """
 
     def __init__(self, store: ViewStore, path: str | Path, namespace: str | None = None) -> None:
-        from ..results.folder import is_results_folder, read_report
+        from ..results.check import looks_like_results
+        from ..results.folder import read_report
 
         self.store = store
         path = Path(path)
         store.title = path.resolve().name
         self._report: dict[str, Any] = {}
-        self._parameters = PipelineParameters()
+        self.parameters = PipelineParameters()
         self._folder: Path | None = None
-        if is_results_folder(path):
-            self._folder, self._report = path, read_report(path)
+        #: What was damaged or unusable, a line each.
+        self.problems: list[str] = []
+        if looks_like_results(path):
+            self._folder = path
+            try:
+                self._report = read_report(path)
+            except CsasError as error:
+                self._problem(error)  # the views are worth a look
             path = path / RESULT_BAG
             if not path.exists():
                 raise ViewerError(
@@ -221,8 +243,6 @@ class PathSource:
         self._spool = Spool()
         self._thread: threading.Thread | None = None
         self.done = threading.Event()
-        #: What was damaged or unusable, a line each.
-        self.problems: list[str] = []
         #: Why not all could be read; empty if it could.
         self.failed = ""
         held = [s for s in VIEW_STREAMS if (t := self._reader.topic(STREAMS[s].image_topic)) and t.count]
@@ -248,11 +268,11 @@ class PathSource:
     def _use_report(self) -> None:
         p = self._report.get("parameters", {})
         values = {
-            part.name: type(getattr(self._parameters, part.name)).from_mapping(p.get(part.name, {}))
-            for part in self._parameters.__dataclass_fields__.values()
+            part.name: type(getattr(self.parameters, part.name)).from_mapping(p.get(part.name, {}))
+            for part in self.parameters.__dataclass_fields__.values()
             if part.name in p
         }
-        self._parameters = replace(self._parameters, **values)
+        self.parameters = replace(self.parameters, **values)
 
     def start(self) -> None:
         """Register what can be read at once; the rest goes on in a thread."""
@@ -266,6 +286,7 @@ class PathSource:
             for name in first:
                 self._register(index, name)
         self._small_parts()
+        self.store.put_part("progress", {"state": "loading"})
         self._thread = threading.Thread(target=self._rest, args=(index, first), name="viewer", daemon=True)
         self._thread.start()
 
@@ -292,6 +313,10 @@ class PathSource:
             truth = self._report.get("truth")
             store.put_part("truth", truth.get("dimensions") if isinstance(truth, dict) else None)
             store.put_part("status", self._report.get("verdict", ""))
+            self._guarded("report.json", lambda: store.put_part("report", about(self._report)))
+            self._guarded("report.json", lambda: store.put_part("contacts", contacts_of(self._report)))
+        if self._folder is not None:
+            self._open_desk(self._folder)
         for _, message, _ in checked_messages(self._reader, "track", self._problem):
             store.put_track(track_from_msg(message))
         for _, message, _ in checked_messages(self._reader, "target", self._problem):
@@ -299,35 +324,79 @@ class PathSource:
         store.put_part("reduced", bool(self._reader.topic("image") or self._reader.topic("sector/image")))
         store.make_reduced = self._make_reduced
 
+    def _guarded(self, what: str, work: Callable[[], Any]) -> None:
+        """Do a part of the work; what fails is named, and costs no other part."""
+        try:
+            work()
+        except Exception as error:  # whatever a damaged file makes of it, it is to be seen on the page
+            kind = "" if isinstance(error, CsasError) else f"{what}: {type(error).__name__}: "
+            self.failed = self.failed or f"{kind}{error}"
+            self._problem(f"{kind}{error}")
+
+    def _open_desk(self, folder: Path) -> None:
+        desk = Desk(folder)
+        try:
+            self.store.put_desk(desk.document())
+            self.store.desk = desk
+        except CsasError as error:
+            # What cannot be read is not written over.
+            self._problem(error)
+            self.store.put_part("desk", {"why": str(error), "revision": 0, "items": {}})
+
+    def _further_objects(self) -> None:
+        p = self.parameters.carving
+        for entry in self._report.get("objects") or []:
+            name = str(entry["files"][0])
+            if self._folder is not None and name != "grid.npz":
+                grid = grid_of_file(self._folder / name, str(self._report.get("method", p.method)))
+                self.store.put_grid(Path(name).stem, grid, p.min_views_fraction)
+
+    def _truth(self) -> None:
+        truth = self._report.get("truth")
+        path = Path(str(truth.get("mesh", ""))) if isinstance(truth, dict) else Path()
+        if path.suffix != ".stl" or not path.is_file():  # it lies beside the bag, which may be elsewhere
+            return
+        mesh = trimesh.load_mesh(path)
+        if len(mesh.faces) <= _MOST_FACES:
+            self.store.put_mesh("truth", mesh)
+
     def _make_reduced(self) -> None:
         run = read_run(self._bag, self._reader.namespace)
-        Reduced(run.coherent_image(), run.require_track(), self._parameters.sub_aperture).fill(self.store)
+        Reduced(run.coherent_image(), run.require_track(), self.parameters.sub_aperture).fill(self.store)
 
     def _rest(self, index: BagIndex | None, first: list[str]) -> None:
         try:
-            self._grid()
-            for name in self._held:
-                if index is None:
-                    for view in self._sequential(name):
-                        self.store.put_view(name, spooled(self._spool, name, view))
-                elif name not in first:
-                    self._register(index, name)
-            self._composites()
-            shape = Shape(self.store, replace(self._parameters.carving, threshold=0.0))
-            measure = not self._report and not self._measured()
-            for name in ("likelihood", "shadow_mask"):
-                if measure or name == shape.other_stream:
-                    for entry in list(self.store.sets[name].values()):
-                        shape.add(name, entry)
-            shape.publish(measure=measure)
-        except (CsasError, OSError, ValueError, KeyError) as error:  # numpy's, of a grid.npz that is none
-            self.failed = str(error) if isinstance(error, CsasError) else f"{type(error).__name__}: {error}"
-            self._problem(self.failed)
-            self.store.put_part("status", self.failed)
+            self._guarded("grid", self._grid)
+            self._guarded("objects", self._further_objects)
+            self._guarded("views", lambda: self._views(index, first))
+            self._guarded("composites", self._composites)
+            self._guarded("truth", self._truth)
+            self._guarded("shape", self._shape)
+            if self.failed:
+                self.store.put_part("status", self.failed)
         finally:
             for line in self._reader.problems:
                 self._problem(line)
+            self.store.put_part("progress", {"state": "done"})
+            self.store.loaded.set()
             self.done.set()
+
+    def _views(self, index: BagIndex | None, first: list[str]) -> None:
+        for name in self._held:
+            if index is None:
+                for view in self._sequential(name):
+                    self.store.put_view(name, spooled(self._spool, name, view))
+            elif name not in first:
+                self._register(index, name)
+
+    def _shape(self) -> None:
+        shape = Shape(self.store, replace(self.parameters.carving, threshold=0.0))
+        measure = not self._report and not self._measured()
+        for name in ("likelihood", "shadow_mask"):
+            if measure or name == shape.other_stream:
+                for entry in list(self.store.sets[name].values()):
+                    shape.add(name, entry)
+        shape.publish(measure=measure)
 
     def _measured(self) -> bool:
         """Show what the bag says of the target's dimensions; False if it says nothing."""
@@ -350,7 +419,7 @@ class PathSource:
                 self._problem(error)
 
     def _grid(self) -> None:
-        p = self._parameters.carving
+        p = self.parameters.carving
         if self._folder is not None and (self._folder / "grid.npz").exists():
             grid = grid_of_folder(self._folder, str(self._report.get("method", p.method)))
             self.store.put_grid("main", grid, p.min_views_fraction)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import tempfile
 import threading
@@ -14,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from msg_adapters.camera_info import GroundInfo
@@ -39,6 +41,15 @@ _CACHE_BYTES = 256 << 20
 #: Two views of one set nearer than this (rad) with different stamps are of different runs.
 _SAME_ASPECT_RAD = 1e-7
 _TRACK_POSES = 720
+
+
+#: What the names of a second run's sets, volumes and pictures begin with, where two are compared.
+SECOND = "b."
+
+
+def kind_of(name: str) -> str:
+    """Return how a set of views is shown; a second run's as the first one's."""
+    return SETS.get(name.removeprefix(SECOND), "")
 
 
 class ViewerError(CsasError):
@@ -128,6 +139,10 @@ class ViewStore:
         self.make_reduced: Callable[[], None] | None = None
         self._cache: OrderedDict[tuple[str, ...], bytes] = OrderedDict()
         self._cached = 0
+        #: Set once all is there that will be; a live run goes on for ever.
+        self.loaded = threading.Event()
+        #: Where judgements are kept; None where there is no results folder.
+        self.desk: Any = None
         self._clear()
 
     def _clear(self) -> None:
@@ -144,7 +159,14 @@ class ViewStore:
             "status": "",
             "damage": "",
             "reduced": False,
+            "contacts": [],
+            "report": None,
+            "progress": None,
+            "desk": {"why": "judgements are kept beside a results folder alone", "revision": 0, "items": {}},
+            "meshes": {},
+            "other": None,
         }
+        self._mesh_bytes: dict[str, bytes] = {}
         self._volume_bytes: dict[str, bytes] = {}
 
     def _tell(self, notice: dict[str, Any]) -> None:
@@ -163,7 +185,7 @@ class ViewStore:
         """Return everything but pixels, as the page gets it when it connects."""
         with self.lock:
             sets = {
-                name: {"kind": SETS[name], "views": [e.as_json() for e in entries.values()]}
+                name: {"kind": kind_of(name), "views": [e.as_json() for e in entries.values()]}
                 for name, entries in self.sets.items()
             }
             about = {"instance": self.instance, "title": self.title, "live": self.live}
@@ -172,7 +194,7 @@ class ViewStore:
     def put_view(self, name: str, entry: Entry) -> None:
         """Add a view, or replace the one of its stamp; a view of another run clears the store first."""
         with self.lock:
-            views = self.sets[name]
+            views = self.sets.setdefault(name, {})
             stamp, aspect = entry.info.stamp_ns, entry.info.aspect_rad
             known = views.get(stamp)
             if known is not None and known.revision == entry.revision:
@@ -232,6 +254,30 @@ class ViewStore:
             self._volume_bytes[name] = data
             self.put_part("volumes", self._parts["volumes"] | {name: about})
 
+    def put_mesh(self, name: str, mesh: trimesh.Trimesh) -> None:
+        """Set a surface that is shown over the carved one: the truth."""
+        data = json.dumps(
+            {"points": np.round(mesh.vertices, 4).ravel().tolist(), "faces": mesh.faces.ravel().tolist()}
+        ).encode()
+        with self.lock:
+            self._mesh_bytes[name] = data
+            about = {"rev": f"{zlib.crc32(data):08x}"}
+            self.put_part("meshes", self._parts["meshes"] | {name: about})
+
+    def mesh(self, name: str) -> bytes:
+        """Return a surface as JSON: points (x, y, z, …) and faces (a, b, c, …)."""
+        with self.lock:
+            if name not in self._mesh_bytes:
+                raise ViewerError(f"there is no surface {name!r}")
+            return self._mesh_bytes[name]
+
+    def put_desk(self, document: Mapping[str, Any]) -> None:
+        """Set what has been judged, and that it can be."""
+        with self.lock:
+            if document["revision"] >= self._parts["desk"]["revision"]:  # two answers may overtake each other
+                told = {"why": "", "revision": document["revision"], "items": document["items"]}
+                self.put_part("desk", told)
+
     def put_dimensions(self, found: Dimensions | Mapping[str, Any] | None) -> None:
         """Set the dimensions with their 95 % intervals."""
         if isinstance(found, Dimensions):
@@ -260,7 +306,7 @@ class ViewStore:
         entry = self.entry(name, stamp_ns)
         return self._cached_bytes(
             (name, str(stamp_ns), entry.revision, kind),
-            lambda: codes.picture(codes.shown(entry.load(), SETS[name]), kind),
+            lambda: codes.picture(codes.shown(entry.load(), kind_of(name)), kind),
         )
 
     def composite_picture(self, name: str) -> bytes:
@@ -271,9 +317,11 @@ class ViewStore:
             _, revision, pixels = self.pictures[name]
         return self._cached_bytes((name, revision), lambda: codes.picture(pixels, "png"))
 
-    def contour(self, stamp_ns: int) -> list[list[float]]:
+    def contour(self, stamp_ns: int, name: str = "shadow_mask") -> list[list[float]]:
         """Return the outline of a view's segmented shadow."""
-        return codes.contour(self.entry("shadow_mask", stamp_ns).load())
+        if kind_of(name) != "mask":
+            raise ViewerError(f"{name[:40]!r} is no set of masks")
+        return codes.contour(self.entry(name, stamp_ns).load())
 
     def _cached_bytes(self, key: tuple[str, ...], make: Callable[[], bytes]) -> bytes:
         with self.lock:

@@ -130,7 +130,9 @@ def test_views_that_have_not_arrived_are_a_gap_that_a_live_run_fills(watched, se
     def bright(aspect: float) -> str:
         k = f"csas.panels[1].slider, a = {math.radians(aspect)}, c = s.ring, f = c.width / s.side"
         pixel = "c.width / 2 + f * s.radius * Math.cos(a), c.width / 2 - f * s.radius * Math.sin(a), 1, 1"
-        return f"(() => {{ const s = {k}; return c.getContext('2d').getImageData({pixel}).data[0]; }})() > 100"
+        return (
+            f"(() => {{ const s = {k}; return c.getContext('2d').getImageData({pixel}).data[0]; }})() > 100"
+        )
 
     watched.settle()
     assert watched.js(bright(62))
@@ -141,12 +143,15 @@ def test_views_that_have_not_arrived_are_a_gap_that_a_live_run_fills(watched, se
     watched.until(f"csas.views('shadow').length === {COUNT}")
     watched.until(bright(222))
     store.put_view("shadow", entry(0, code=200))  # a new revision of the view that is shown
-    watched.until("csas.panels[1].found.about.rev === csas.sameStamp('shadow', csas.current).rev && csas.panels[1].found.exact")
+    watched.until(
+        "csas.panels[1].found.about.rev === csas.sameStamp('shadow', csas.current).rev && csas.panels[1].found.exact"
+    )
 
 
 def test_zoom_and_pan_are_linked_and_sonar_up_turns_the_shadow_downwards(watched, serve, run_store):
     watched.open(serve(run_store))
     page = watched.page
+    page.keyboard.press("0")  # the whole scene
     x, y = middle(watched)
     page.mouse.move(x + 40, y)
     before = watched.js("csas.state.zoom")
@@ -181,7 +186,9 @@ def test_every_layer_shows_a_picture_and_the_range_changes_it(watched, serve, ru
     page, seen = watched.page, set()
     for key in "123456":
         page.keyboard.press(key)
-        watched.until("csas.panels[1].found?.bitmap && csas.panels[1].found.exact && !csas.panels[1].found.late", 30)
+        watched.until(
+            "csas.panels[1].found?.bitmap && csas.panels[1].found.exact && !csas.panels[1].found.late", 30
+        )
         watched.drawn()
         data = watched.js("csas.panels[1].slider.picture.toDataURL()")
         assert data not in seen
@@ -218,7 +225,7 @@ def test_the_ruler_reads_a_shadow_and_the_height_that_it_implies(watched, serve,
     watched.page.mouse.move(x, y + 85)
     watched.page.mouse.up()
     watched.drawn()
-    a, b = watched.js("csas.state.ruler")
+    a, b = watched.js("csas.ruler.ends")
     sonar = np.array(watched.js("csas.current.sonar"))
     # Independently: the ray from the sonar to the tip passes over the start at this height.
     tip, start = np.array(b), np.array(a)
@@ -254,7 +261,9 @@ def test_the_surface_follows_the_threshold_and_stays_near_the_measured_one(watch
     for name in ("main", "other"):
         exact = len(mesh_from_grid(run_store.grids[name]).faces)
         assert watched.js(f"csas.solid.sides.{name}.triangles") == pytest.approx(exact, rel=0.3)
-    points = np.array(watched.js("Array.from(csas.solid.sides.main.mesh.geometry.attributes.position.array)")).reshape(-1, 3)
+    points = np.array(
+        watched.js("Array.from(csas.solid.sides.main.mesh.geometry.attributes.position.array)")
+    ).reshape(-1, 3)
     faces = np.array(watched.js("Array.from(csas.solid.sides.main.mesh.geometry.index.array)")).reshape(-1, 3)
     mesh = trimesh.Trimesh(points, faces)
     shared = np.unique(mesh.edges_sorted, axis=0, return_counts=True)[1]
@@ -265,7 +274,9 @@ def test_the_surface_follows_the_threshold_and_stays_near_the_measured_one(watch
     for _ in range(12):
         page.keyboard.press("ArrowLeft")
     watched.until(f"csas.solid.sides.main.triangles !== {before}")
-    watched.until("csas.surfaceMeasures?.object && document.querySelector('#dimensions').innerText.includes('surface here')")
+    watched.until(
+        "csas.surfaceMeasures?.object && document.querySelector('#dimensions').innerText.includes('surface here')"
+    )
     colours = watched.js(
         "(() => { csas.solid.render(); const c = document.createElement('canvas'); c.width = c.height = 100; const g = c.getContext('2d');"
         " g.drawImage(csas.solid.canvas, 0, 0, 100, 100); return new Set(g.getImageData(0, 0, 100, 100).data).size; })()"
@@ -279,7 +290,9 @@ def test_soft_and_hard_stand_side_by_side_with_evidence_track_and_dimensions(wat
     page = watched.page
     for key in "bv":
         page.keyboard.press(key)
-    watched.until("csas.state.compare && csas.solid.sides.main.points.geometry.attributes.position?.count > 50")
+    watched.until(
+        "csas.state.compare && csas.solid.sides.main.points.geometry.attributes.position?.count > 50"
+    )
     assert page.locator("#tag-main").inner_text() == "Silhouettes"
     assert page.locator("#tag-other").inner_text() == "Soft carving"
     text = page.locator("#dimensions").inner_text()
@@ -333,7 +346,13 @@ def test_every_key_of_the_help_does_what_it_says(watched, serve, run_store):
 
     page.keyboard.press("Tab")  # the first button: keys work wherever the focus is
     step = 360 / js("csas.views('shadow').length")
-    for key, views in (("ArrowRight", 1), ("ArrowLeft", 0), ("Shift+ArrowRight", 10), ("Home", 0), ("End", -1)):
+    for key, views in (
+        ("ArrowRight", 1),
+        ("ArrowLeft", 0),
+        ("Shift+ArrowRight", 10),
+        ("Home", 0),
+        ("End", -1),
+    ):
         press(key)
         assert js("csas.current.aspect_deg") == pytest.approx(views * step % 360), key
     for key, expression, before, after in (
@@ -341,6 +360,7 @@ def test_every_key_of_the_help_does_what_it_says(watched, serve, run_store):
         ("c", "csas.state.contour", True, False),
         ("m", "csas.state.cast", False, True),
         ("b", "csas.state.compare", False, True),
+        ("o", "csas.state.overlay", False, True),
         ("v", "csas.state.evidence", False, True),
         ("k", "document.querySelector('#whole').checked", False, True),
         ("r", "csas.state.ruling", False, True),
@@ -350,6 +370,7 @@ def test_every_key_of_the_help_does_what_it_says(watched, serve, run_store):
         assert js(expression) == after, key
         press(key)
         assert js(expression) == before, key
+    press("0")
     press("+")
     assert js("csas.state.zoom") == pytest.approx(1.25)
     centre = js("csas.state.centre")
@@ -377,9 +398,15 @@ def test_every_key_of_the_help_does_what_it_says(watched, serve, run_store):
         press(f"Shift+Digit{number}")
         assert js("csas.panels.map(p => p.layer)") == [layer, layer]
     press("r")
-    before = js("csas.state.ruler[1]")
+    press("ArrowUp")
+    before = js("csas.ruler.ends[1]")
     press("ArrowRight")
-    assert js("csas.state.ruler[1][0]") > before[0]
+    assert js("csas.ruler.ends[1][0]") > before[0]
+    press("Delete")
+    assert js("csas.allRulers().length") == 0
+    press("z")
+    assert js("csas.state.zoom") > 1
+    press("0")
     press("t")
     surfaces, threshold = js("[csas.stats.surfaces.length, +document.activeElement.value]")
     press("ArrowRight")
@@ -437,7 +464,10 @@ def test_another_run_at_the_same_address_leaves_nothing_of_the_first(watched, se
     serve(other, port=first.port)
     watched.until("document.querySelector('#title').textContent === 'another run'")
     watched.until("csas.views('shadow').length === 90")
-    assert watched.js("[csas.solid.sides.main.mesh.visible, csas.solid.sides.other.mesh.visible]") == [False, False]
+    assert watched.js("[csas.solid.sides.main.mesh.visible, csas.solid.sides.other.mesh.visible]") == [
+        False,
+        False,
+    ]
     assert "surface here" not in watched.page.locator("#dimensions").inner_text()
     for row in ("#row-main", "#row-other"):
         assert not watched.page.locator(row).is_visible()
@@ -514,7 +544,9 @@ def test_one_html_file_opens_without_a_server(watched, run_store, tmp_path):
     watched.open(path.as_uri())
     watched.until("csas.solid.sides.main.triangles > 0")
     watched.js("csas.setAspect(100)")
-    watched.until("csas.panels.every(p => p.found?.bitmap && !p.found.late) && csas.current.aspect_deg === 100")
+    watched.until(
+        "csas.panels.every(p => p.found?.bitmap && !p.found.late) && csas.current.aspect_deg === 100"
+    )
     assert [a for a in watched.asked if not a.startswith(("file:", "data:", "blob:"))] == []
 
 

@@ -109,7 +109,7 @@ def test_reduced_views_of_another_run_have_other_addresses(tiny_box_bag) -> None
 
 
 def test_a_token_is_told_so_that_its_address_opens(serve) -> None:
-    url = serve(ViewStore(), host="0.0.0.0", token="a b&c#é")
+    url = serve(ViewStore(), host="0.0.0.0", token="a b&c#é, and more")
     assert "0.0.0.0" not in url
     assert get(url.replace(socket.gethostname(), "127.0.0.1"))[0] == 200
 

@@ -1,10 +1,19 @@
 import { coarseToFine, Loader } from "./loader.js";
-import { inverse, LAYERS, Panel } from "./panel.js";
+import { Desk, newId } from "./desk.js";
+import { inverse, isOther, LAYERS, OTHER_LAYERS, Panel } from "./panel.js";
 import { Solid } from "./solid.js";
 
 const $ = (id) => document.getElementById(id);
-const DEFAULTS = { aspect: 0, layers: ["sub_aperture", "shadow"], zoom: 1, centre: [0, 0], orientation: "north", top: 18, range: 38, contour: true, cast: false, compare: false, evidence: false, thresholds: {} };
+const DEFAULTS = { aspect: 0, layers: ["sub_aperture", "shadow"], zoom: 1, centre: [0, 0], orientation: "north", top: 18, range: 38, contour: true, cast: false, compare: false, evidence: false, overlay: false, truth: false, section: "off", cut: 0.5, follow: false, contact: "", camera: [], rulers: [], thresholds: {} };
 const REST_MS = 160;
+const RAD = Math.PI / 180;
+// A ruler's error in length is 1 / cos of its angle to the ray from the sonar: 1.5 % at this one.
+const ALONG_DEG = 10;
+// Of a ruler's length so much must lie in the segmented shadow, where there is one.
+const IN_SHADOW = 0.5;
+// The picture that is saved, whatever the screen is.
+const SAVED_PX = 1600;
+const METHODS = { soft: "Soft carving", hard: "Hard carving", consensus: "Silhouettes" };
 
 class App {
   constructor() {
@@ -12,7 +21,12 @@ class App {
     const content = held && JSON.parse(held.textContent);
     const linked = this.fromLink();
     this.linkedLayers = !!linked.layers;
-    this.state = { ...structuredClone(DEFAULTS), ...linked, ruling: false, ruler: null };
+    this.framed = "zoom" in linked || "centre" in linked; // by the link; else the contact is gone to
+    this.state = { ...structuredClone(DEFAULTS), ...linked, ruling: false };
+    // Rulers that are not kept in the results folder; a link takes them along.
+    this.rulers = this.state.rulers.map(([stamp, aspect, ...e]) => ({ id: newId("ruler"), stamp, aspect_deg: aspect, ends: [e.slice(0, 2), e.slice(2)] }));
+    this.ruler = this.rulers.at(-1) ?? null;
+    this.pick = null;
     this.scene = { sets: {}, pictures: {}, volumes: {}, track: [], target: null, dimensions: null, codes: { low_db: -32, step_db: 0.25 } };
     this.sorted = {};
     this.volumes = {};
@@ -21,13 +35,14 @@ class App {
     const startWorker = () => new Worker(this.workerAddress(content?.files));
     this.loader = new Loader(content?.files, startWorker, () => this.dirty());
     this.panels = [new Panel($("panel-a"), this, this.state.layers[0], "Left"), new Panel($("panel-b"), this, this.state.layers[1], "Right")];
+    this.desk = new Desk(this);
     this.startSurfaces(startWorker());
     // The first picture goes before the first object.
     setTimeout(() => this.startSolid(), 1500);
     this.controls();
     if (content) {
       $("link").textContent = "saved file";
-      $("save-html").hidden = $("save-mesh-row").hidden = true; // the server makes these
+      for (const id of ["save-html", "save-mesh-row", "save-circle", "report"]) $(id).hidden = true; // the server makes these
       this.all(content.scene);
     } else this.connect();
   }
@@ -35,7 +50,9 @@ class App {
   startSolid() {
     if (this.solid) return;
     this.solid = new Solid($("gl"), $("stage-note"), this);
-    for (const name of ["track", "target", "volumes"]) this.part(name);
+    for (const name of ["track", "target", "volumes", "meshes"]) this.part(name);
+    if (this.state.camera.length) this.solid.lookFrom(this.state.camera);
+    else this.desk.goTo3d();
   }
 
   // The run, as the server tells it
@@ -52,17 +69,54 @@ class App {
   }
 
   linked(on) {
-    $("link").textContent = on ? (this.scene.live ? "live" : "connected") : "viewer is away: waiting for it";
+    this.away = !on;
     $("link").classList.toggle("on", on);
     this.loader.paused = !on;
+    this.badge();
+  }
+
+  // How the run goes, in one line: a page that stands still is to be told from a graph that does.
+  badge() {
+    if (this.loader.files) return;
+    const p = this.scene.progress, live = this.scene.live;
+    let text = "connected", good = !this.away;
+    if (this.away) text = "viewer is away: waiting for it";
+    else if (live && p) {
+      const of = `${p.views}${p.of ? ` of ${p.of}` : ""} views`;
+      const newest = p.newest_s === null ? "" : `, newest ${p.newest_s < 120 ? `${p.newest_s} s` : `${Math.round(p.newest_s / 60)} min`} ago`;
+      good = p.state === "running" || p.state === "finished";
+      text = { running: `live: ${of}${p.rate ? ` at ${p.rate} /s` : ""}${newest}`, finished: `finished: ${of}`, silent: `the graph is silent for ${p.silent_s} s: ${of}${newest}`, waiting: `no graph is heard: ${of}` }[p.state] ?? of;
+    } else if (live) text = "live";
+    else if (p?.state === "loading") text = `reading: ${this.views(this.guide).length} views`;
+    else text = `${this.views(this.guide).length} views`;
+    $("link").textContent = text;
+    $("link").classList.toggle("on", good);
+  }
+
+  // What a picture that is empty waits for.
+  awaited(panel) {
+    const p = this.scene.progress, layer = panel.layer, known = this.scene.sets[layer]?.views.length ?? 0;
+    if (known || panel.six && this.views(panel.six).length) return "loading the picture";
+    if (!this.scene.instance) return this.away === undefined ? "connecting to the viewer" : "the viewer is away";
+    if (layer === "reduced") return this.scene.reduced ? "making the views of 4°" : "needs the full-circle image, which this run has not";
+    const what = panel.select.selectedOptions[0]?.text.toLowerCase() ?? layer;
+    if (this.scene.live) {
+      if (!p || p.state === "waiting") return "waiting for a graph: none is heard";
+      if (p.state === "silent") return `the graph is silent for ${p.silent_s} s; waiting for ${what}`;
+      return `waiting for ${what}: ${p.views}${p.of ? ` of ${p.of}` : ""} views have come`;
+    }
+    if (p?.state === "loading") return `reading the run: ${what} is to come`;
+    return `this run holds no ${what}`;
   }
 
   notice(n) {
     if (n.type === "all") this.all(n.scene);
     else if (n.type === "view") {
-      const set = this.scene.sets[n.set], at = set.views.findIndex((v) => v.stamp === n.view.stamp);
+      const set = (this.scene.sets[n.set] ??= { views: [] }), first = !set.views.length, at = set.views.findIndex((v) => v.stamp === n.view.stamp);
       if (at >= 0) set.views[at] = n.view; else set.views.push(n.view);
       delete this.sorted[n.set];
+      if (first) this.settleLayers();
+      if (this.scene.live && this.state.follow && n.set === this.guide && !this.scrubbing() && this.scene.progress?.state !== "finished") this.newest = n.view.aspect_deg;
       this.later();
     } else if (n.type === "part") {
       this.scene[n.part] = n.value;
@@ -72,7 +126,7 @@ class App {
   }
 
   later() {
-    this.timer ??= setTimeout(() => { this.timer = undefined; this.refetch(); this.dirty(); }, 60);
+    this.timer ??= setTimeout(() => { this.timer = undefined; this.refetch(); if (this.newest !== undefined) this.setAspect(this.newest); this.newest = undefined; this.badge(); this.dirty(); }, 60);
   }
 
   all(scene) {
@@ -84,8 +138,9 @@ class App {
     this.sorted = {};
     document.title = `${scene.title || "CSAS"} — shadows`;
     $("title").textContent = scene.title || "CSAS shadows";
-    if ($("link").classList.contains("on")) this.linked(true);
-    for (const name of ["track", "target", "volumes", "dimensions", "pictures", "damage", "reduced"]) this.part(name);
+    this.badge();
+    $("follow-row").hidden = !scene.live;
+    for (const name of ["track", "target", "volumes", "dimensions", "pictures", "damage", "reduced", "contacts", "report", "other", "desk", "meshes"]) this.part(name);
     this.refetch();
     this.dirty();
   }
@@ -106,21 +161,79 @@ class App {
       this.solid?.surroundings();
       if (this.solid && name === "target" && this.scene.target && !this.looked) { this.looked = true; this.solid.whole(false); }
     } else if (name === "volumes" && this.solid) {
-      for (const each of ["main", "other"]) if (this.scene.volumes[each]) this.fetchVolume(each); else this.dropVolume(each);
+      for (const each of new Set(["main", "other", ...Object.keys(this.volumes), ...Object.keys(this.scene.volumes)])) if (this.scene.volumes[each]) this.fetchVolume(each); else this.dropVolume(each);
     } else if (name === "damage") {
       $("damage").hidden = !this.scene.damage;
       $("damage").textContent = $("damage").title = this.scene.damage ?? "";
     } else if (name === "reduced") {
       if (this.scene.reduced && this.panels.some((p) => p.layer === "reduced")) this.wantReduced();
-    } else if (name === "dimensions" || name === "truth") this.dimensions();
+    } else if (name === "dimensions" || name === "truth" || name === "status") this.dimensions();
+    else if (name === "progress") this.badge();
+    else if (name === "meshes" && this.solid && this.scene.meshes?.truth) this.fetchTruth();
+    else if (name === "contacts" || name === "report" || name === "desk" || name === "other") {
+      this.derive();
+      this.desk.show();
+      this.dimensions();
+      if (name === "other") {
+        this.solid?.place();
+        for (const p of this.panels) p.offer(this.scene.other ? [...LAYERS, ...OTHER_LAYERS] : LAYERS);
+        this.settleLayers();
+      }
+    }
+    if (name === "contacts" || name === "target") this.frame1st();
     if (name === "track" || name === "pictures") this.refetch();
   }
 
-  // Pictures that nobody chose by hand show what there is.
+  // What the circle shows of each view, and which way is north.
+  derive() {
+    const r = this.scene.report, other = this.scene.other;
+    this.north = r?.north_deg ?? 0;
+    this.evidence = r?.heights?.length || r?.rejected?.length ? { heights: r.heights ?? [], median: r.height_median_m, rejected: r.rejected ?? [] } : undefined;
+    this.offset = other?.offset_m ?? [0, 0];
+  }
+
+  get contact() {
+    const all = this.scene.contacts ?? [];
+    return all.find((c) => c.id === this.state.contact) ?? all[0];
+  }
+
+  // Where the chosen contact is; of a live run that knows none yet, the volume that is carved.
+  get place() {
+    const c = this.contact, t = this.scene.target;
+    if (c) return { centre: c.position_m, size: c.size_m, height: c.height_m ?? 0.4 };
+    return t && { centre: t.centre, size: 0.75 * Math.max(t.size[0], t.size[1]), height: t.size[2] };
+  }
+
+  frame1st() {
+    if (this.framed || !this.place || !this.current) return;
+    this.framed = true;
+    this.zoomToContact();
+  }
+
+  // The contact with the shadow that it throws to whatever side, and a margin.
+  zoomToContact() {
+    const place = this.place, view = this.current;
+    if (!place || !view) return this.fit();
+    const ground = Math.hypot(view.sonar[0] - place.centre[0], view.sonar[1] - place.centre[1]);
+    const shadow = (place.height * ground) / Math.max(0.1, view.sonar[2] - place.height);
+    const reach = 1.15 * (place.size / 2 + shadow);
+    this.state.zoom = Math.min(40, Math.max(0.5, this.sceneRadius / reach));
+    this.state.centre = [place.centre[0], place.centre[1]];
+    this.save();
+    this.dirty();
+  }
+
+  // Pictures that nobody chose by hand show what there is, and what they were made for as soon as it is there.
   settleLayers() {
-    const there = LAYERS.map(([name]) => name).filter((name) => this.scene.sets[name]?.views.length);
+    const there = [...LAYERS, ...OTHER_LAYERS].map(([name]) => name).filter((name) => this.scene.sets[name]?.views.length);
     if (!there.length) return;
-    this.panels.forEach((p, i) => { if (!p.chosen && !there.includes(p.layer)) p.layer = p.select.value = there[Math.min(i, there.length - 1)]; });
+    const wish = this.scene.other ? ["shadow", "b.shadow"] : DEFAULTS.layers;
+    this.panels.forEach((p, i) => {
+      if (p.chosen) return;
+      const layer = there.includes(wish[i]) ? wish[i] : there[Math.min(i, there.length - 1)];
+      if (layer !== p.layer) { p.layer = p.select.value = layer; this.refetch(); }
+    });
+    this.frame1st();
   }
 
   views(name) {
@@ -139,10 +252,10 @@ class App {
 
   get guide() { return ["shadow", "sub_aperture", "likelihood", "shadow_mask"].find((n) => this.views(n).length) ?? "shadow"; }
 
-  nearestOf(views) {
+  nearestOf(views, aspect = this.state.aspect) {
     let best = -1, least = 1e9;
     views.forEach((v, i) => {
-      const off = Math.abs(((v.aspect_deg - this.state.aspect + 540) % 360) - 180);
+      const off = Math.abs(((((v.aspect_deg - aspect + 540) % 360) + 360) % 360) - 180);
       if (off < least) [least, best] = [off, i];
     });
     return best;
@@ -155,6 +268,7 @@ class App {
     views.byStamp ??= new Map(views.map((v) => [v.stamp, v]));
     return views.byStamp.get(view.stamp);
   }
+  contourAddress(run, mask) { return `api/contour/${mask.stamp}/${mask.rev}.json${run ? `?set=${run}shadow_mask` : ""}`; }
   address(name, view, kind) { return `api/view/${name}/${view.stamp}/${view.rev}.${kind}`; }
 
   get sceneRadius() {
@@ -177,6 +291,7 @@ class App {
     const wanted = [], ahead = Math.sign(this.velocity || 1), rest = !this.scrubbing() && !this.playing;
     for (const p of this.panels) {
       if (p.found?.wanted) wanted.push(p.found.wanted);
+      if (p.six) wanted.push(...(p.sixWanted ?? []));
       if (rest && p.isView && p.found?.about && !p.found.about.kept && !this.loader.files) wanted.push(this.address(p.layer, p.found.about, "png"));
     }
     for (let i = 1; i <= 6; i++)
@@ -199,7 +314,9 @@ class App {
 
   // State
 
-  setAspect(aspect, when = performance.now()) {
+  setAspect(aspect, when = performance.now(), byHand = false) {
+    // Whoever turns the circle wants to stay there.
+    if (byHand && this.state.follow) this.state.follow = $("follow").checked = false;
     const turn = ((aspect - this.state.aspect + 540) % 360) - 180;
     this.velocity = turn;
     this.state.aspect = aspect;
@@ -228,11 +345,12 @@ class App {
 
   save() {
     clearTimeout(this.saving);
-    this.saving = setTimeout(() => history.replaceState(null, "", this.link()), 200);
+    this.saving = setTimeout(() => history.replaceState(null, "", this.link()), 200); // a browser takes so many a second
   }
 
   link() {
-    const s = this.state, kept = { ...s, layers: this.panels.map((p) => p.layer) };
+    const s = this.state, kept = { ...s, layers: this.panels.map((p) => p.layer), rulers: this.rulers.map((r) => [r.stamp, r.aspect_deg, ...r.ends.flat()]) };
+    if (this.solid?.moved) kept.camera = this.solid.seenFrom();
     delete kept.ruling;
     return `#${encodeURIComponent(JSON.stringify(kept, (_, v) => (typeof v === "number" ? +v.toFixed(4) : v)))}`;
   }
@@ -241,9 +359,11 @@ class App {
     let told = {};
     try { told = JSON.parse(decodeURIComponent(location.hash.slice(1))); } catch { /* no link of ours */ }
     // Whoever shortens or edits a link gets the default for what is not understood.
-    const like = (a, b) => typeof a === typeof b && (typeof a !== "number" || Number.isFinite(a)) && (!Array.isArray(b) || (Array.isArray(a) && a.length === b.length && a.every((v, i) => like(v, b[i]))));
+    const like = (a, b) => typeof a === typeof b && (typeof a !== "number" || Number.isFinite(a)) && (!Array.isArray(b) || !b.length || (Array.isArray(a) && a.length === b.length && a.every((v, i) => like(v, b[i]))));
     const kept = Object.fromEntries(Object.entries(told ?? {}).filter(([key, value]) => value !== null && key in DEFAULTS && like(value, DEFAULTS[key])));
-    if (kept.layers) kept.layers = kept.layers.map((name, i) => (LAYERS.some(([each]) => each === name) ? name : DEFAULTS.layers[i]));
+    if (kept.layers) kept.layers = kept.layers.map((name, i) => ([...LAYERS, ...OTHER_LAYERS].some(([each]) => each === name) ? name : DEFAULTS.layers[i]));
+    kept.rulers = (kept.rulers ?? []).filter((r) => Array.isArray(r) && r.length === 6 && /^[0-9]{1,20}$/.test(r[0]) && r.slice(1).every(Number.isFinite)).slice(0, 100);
+    if (kept.camera && !(kept.camera.length === 6 && kept.camera.every(Number.isFinite))) delete kept.camera;
     return kept;
   }
 
@@ -260,10 +380,10 @@ class App {
     const view = this.current;
     this.solid?.sonar(view);
     if (view) {
-      const bearing = (450 - view.aspect_deg) % 360, t = new Date(Number(BigInt(view.stamp) / 1000000n)).toISOString().slice(0, 23).replace("T", " ");
+      const bearing = (810 + this.north - view.aspect_deg) % 360, t = new Date(Number(BigInt(view.stamp) / 1000000n)).toISOString().slice(0, 23).replace("T", " ");
       $("where").textContent = `aspect ${view.aspect_deg.toFixed(1)}° · sonar bears ${bearing.toFixed(1).padStart(5, "0")}° · ${t}Z`;
     }
-    if (this.state.ruler) $("measured").textContent = this.measured();
+    this.say();
     const shown = this.panels.map((p) => p.found?.about?.stamp ?? "").join();
     const all = this.panels.every((p) => p.found?.bitmap), late = this.panels.some((p) => p.found?.late);
     if (all && !this.stats.first) { this.stats.first = performance.now(); setTimeout(() => this.startSolid(), 50); }
@@ -275,12 +395,105 @@ class App {
     }
   }
 
-  measured() {
-    const [a, b] = this.state.ruler, view = this.current, d = Math.hypot(b[0] - a[0], b[1] - a[1]);
-    if (!view) return `${d.toFixed(3)} m`;
+  // Rulers
+
+  // Those of the view that is shown, and those kept of it: each belongs to its aspect.
+  rulersHere() {
+    const stamp = this.current?.stamp;
+    return this.allRulers().filter((r) => r.stamp === stamp);
+  }
+
+  allRulers() { return [...this.desk.keptRulers(), ...this.rulers]; }
+
+  newRuler(a, b) {
+    const view = this.current;
+    this.ruler = { id: newId("ruler"), stamp: view?.stamp ?? "0", aspect_deg: view?.aspect_deg ?? 0, ends: [a, b] };
+    this.rulers.push(this.ruler);
+    this.desk.later();
+    return this.ruler;
+  }
+
+  moveEnd(ruler, end, to) {
+    ruler.ends[end] = to;
+    ruler.touched = true;
+    this.ruler = ruler;
+    this.dirty();
+  }
+
+  ruled(ruler) {
+    if (ruler.kept && ruler.touched) this.desk.keepRuler(ruler);
+    ruler.touched = false;
+    this.desk.later();
+    this.save();
+  }
+
+  // Distance, and the height that the shadow implies; why not, where it runs along none.
+  measured({ ends: [a, b], stamp }) {
+    const distance = Math.hypot(b[0] - a[0], b[1] - a[1]), view = this.sameStamp(this.guide, { stamp });
+    if (!view) return { distance, why: "its view is not there" };
     const [sx, sy, sz] = view.sonar, ra = Math.hypot(a[0] - sx, a[1] - sy), rb = Math.hypot(b[0] - sx, b[1] - sy);
-    const psi = Math.atan2(sz, rb), L = rb - ra, h = L * Math.tan(psi);
-    return `${d.toFixed(2)} m; shadow L = ${L.toFixed(2)} m → h = L · tan ψ = ${L.toFixed(2)} m × tan ${((psi * 180) / Math.PI).toFixed(1)}° = ${h.toFixed(2)} m (ψ: grazing angle at the shadow's tip)`;
+    const off = Math.acos(Math.min(1, Math.max(-1, ((b[0] - a[0]) * (a[0] - sx) + (b[1] - a[1]) * (a[1] - sy)) / (distance * ra || 1)))) / RAD;
+    if (!(distance > 0)) return { distance, why: "drag along a shadow, away from the sonar" };
+    if (off > ALONG_DEG) return { distance, why: `it runs ${off.toFixed(0)}° off the ray from the sonar, expected ${ALONG_DEG}° at most: along a shadow, away from the sonar` };
+    const share = this.inShadow(view, a, b);
+    if (share < IN_SHADOW) return { distance, why: `${Math.round(100 * share)} % of it lies in the segmented shadow, expected ${100 * IN_SHADOW} % or more` };
+    const psi = Math.atan2(sz, rb), L = rb - ra;
+    return { distance, L, psi: psi / RAD, height: L * Math.tan(psi) };
+  }
+
+  // Share of a line that lies in a view's segmented shadow; 1 where nobody knows.
+  inShadow(view, a, b) {
+    const mask = this.sameStamp("shadow_mask", view), lines = mask && this.loader.lines(this.contourAddress("", mask));
+    if (!lines) return 1;
+    const A = mask.A;
+    let inside = 0;
+    for (let i = 0; i < 50; i++) {
+      const f = (i + 0.5) / 50, x = a[0] + f * (b[0] - a[0]), y = a[1] + f * (b[1] - a[1]);
+      const u = A[0] * x + A[1] * y + A[2], v = A[3] * x + A[4] * y + A[5];
+      let odd = false;
+      for (const line of lines)
+        for (let j = 0, n = line.length, k = n - 2; j < n; k = j, j += 2)
+          if (line[j + 1] > v !== line[k + 1] > v && u < ((line[k] - line[j]) * (v - line[j + 1])) / (line[k + 1] - line[j + 1]) + line[j]) odd = !odd;
+      inside += odd;
+    }
+    return inside / 50;
+  }
+
+  say() {
+    const here = this.rulersHere(), ruler = here.includes(this.ruler) ? this.ruler : here.at(-1);
+    let text = "";
+    if (ruler) {
+      const m = this.measured(ruler);
+      text = m.height === undefined ? `${m.distance.toFixed(2)} m; no height: ${m.why}`
+        : `${m.distance.toFixed(2)} m; shadow L = ${m.L.toFixed(2)} m → h = L · tan ψ = ${m.L.toFixed(2)} m × tan ${m.psi.toFixed(1)}° = ${m.height.toFixed(2)} m (ψ: grazing angle at the shadow's tip)`;
+    } else if (this.state.ruling) text = "Ruler: drag along a shadow, away from the sonar.";
+    else text = this.panels[1].slider.told(this.current?.aspect_deg);
+    if ($("measured").textContent !== text) $("measured").textContent = text;
+  }
+
+  // Linked picking: a point of a picture is its line from the sonar, a point on the shape its shadow.
+
+  pickGround(at) {
+    const old = this.pick?.ground, near = old && Math.hypot(old[0] - at[0], old[1] - at[1]) < (0.03 * this.sceneRadius) / this.state.zoom;
+    this.pick = near ? null : { ground: at };
+    this.solid?.showPick();
+    this.dirty();
+  }
+
+  pickPoint(point) {
+    this.pick = point && { point };
+    this.solid?.showPick();
+    this.dirty();
+  }
+
+  // Where what is picked lies in a view: a point of the seabed itself, or the shadow P · X of a point.
+  pickedGround(view) {
+    const { ground, point } = this.pick ?? {};
+    if (!point) return ground;
+    const [x, y, z] = point, P = view.P, w = P[8] * x + P[9] * y + P[10] * z + P[11];
+    const u = (P[0] * x + P[1] * y + P[2] * z + P[3]) / w, v = (P[4] * x + P[5] * y + P[6] * z + P[7]) / w;
+    const [a, b, c, d, e, f] = inverse(view.A);
+    return [a * u + b * v + c, d * u + e * v + f];
   }
 
   // The object
@@ -293,15 +506,18 @@ class App {
 
   startSurfaces(worker) {
     this.worker = worker;
+    this.nextSurface = new Map();
     this.worker.onmessage = ({ data }) => {
-      if (data.did === "surface" && !this.volumes[data.name]) this.busySurface = false; // of a run that is gone
+      if (data.did === "surface" && (!this.volumes[data.name] || !data.faces)) this.busySurface = false; // of a run that is gone
       else if (data.did === "surface") {
         this.stats.surfaces.push(performance.now() - data.asked);
         this.busySurface = false;
         this.solid.set(data.name, data);
-        $(`row-${data.name}`).dataset.triangles = data.faces.length / 3;
-        if (data.name === "main") this.casts.clear();
-        if (this.nextSurface) { const next = this.nextSurface; this.nextSurface = undefined; this.surface(...next); }
+        const row = $(`row-${data.name}`);
+        if (row) row.dataset.triangles = data.faces.length / 3;
+        if (data.name === this.castName) this.casts.clear();
+        const next = this.nextSurface.entries().next().value;
+        if (next) { this.nextSurface.delete(next[0]); this.surface(...next[1]); }
       } else {
         this.casts.set(data.key, data.lines);
         if (this.casts.size > 400) this.casts.delete(this.casts.keys().next().value);
@@ -319,14 +535,16 @@ class App {
       const codes = new Uint8Array(bytes);
       this.volumes[name] = { ...about, codes };
       this.worker.postMessage({ do: "volume", name, volume: { shape: about.shape, origin: about.origin, voxel: about.voxel }, bytes: codes.buffer.slice(0) });
-      $(`row-${name}`).hidden = false;
-      const row = $(`row-${name}`), label = { soft: "Soft carving", hard: "Hard carving", consensus: "Silhouettes" }[about.method] ?? about.method;
-      row.querySelector("span").textContent = label;
+      const auto = about.threshold === null ? 1 : Math.max(1, 254 * Math.sqrt(about.threshold));
+      this.auto = { ...this.auto, [name]: auto };
+      const row = $(`row-${name}`), label = METHODS[about.method] ?? about.method;
+      // Further objects, and a second run's, stand at the threshold that they were measured at.
+      if (!row) return void this.surface(name, auto, performance.now());
+      row.hidden = false;
+      row.querySelector("label span").textContent = label;
       $(`tag-${name}`).textContent = label;
       const input = $(`threshold-${name}`);
       input.max = about.method === "soft" ? 254 : 160;
-      const auto = about.threshold === null ? 1 : Math.max(1, 254 * Math.sqrt(about.threshold));
-      this.auto = { ...this.auto, [name]: auto };
       const chosen = this.state.thresholds[about.method] ?? auto; // a threshold of another method means nothing
       input.value = chosen;
       this.threshold(name, chosen);
@@ -334,12 +552,13 @@ class App {
   }
 
   dropVolume(name) {
-    $(`row-${name}`).hidden = true;
+    if ($(`row-${name}`)) $(`row-${name}`).hidden = true;
     if (!this.volumes[name]) return;
     delete this.volumes[name];
     this.worker.postMessage({ do: "drop", name });
     this.solid.set(name, { points: new Float32Array(0), faces: new Uint32Array(0) });
     this.solid.evidence(name, { codes: new Uint8Array(0), shape: [0, 0, 0], origin: [0, 0, 0], voxel: 1 }, 1);
+    if (!$(`row-${name}`)) return;
     delete $(`row-${name}`).dataset.triangles;
     $(`tag-${name}`).textContent = "";
     if (name !== "main") return;
@@ -351,7 +570,9 @@ class App {
 
   threshold(name, code) {
     const value = (code / 254) ** 2, row = $(`row-${name}`);
-    row.querySelector("output").textContent = value < 0.1 ? value.toFixed(4) : value.toFixed(3);
+    const hard = this.volumes[name]?.method === "consensus" && code <= 1.5;
+    row.querySelector("output").textContent = hard ? "hard carving" : value < 0.1 ? value.toFixed(4) : value.toFixed(3);
+    row.querySelector("button").disabled = Math.abs(code - this.auto[name]) < 1e-9;
     this.surface(name, code, performance.now());
     if (this.state.evidence && this.volumes[name]) this.solid.evidence(name, this.volumes[name], Math.min(254, code * 1.25));
     if (name !== "main" || this.loader.files) return;
@@ -360,12 +581,8 @@ class App {
   }
 
   surface(name, code, asked) {
-    // Only the newest threshold is worked on after the one under way.
-    if (this.busySurface) {
-      if (this.nextSurface && this.nextSurface[0] !== name) setTimeout(() => this.surface(name, code, asked), 30);
-      else this.nextSurface = [name, code, asked];
-      return;
-    }
+    // Only the newest threshold of each is worked on after the one under way.
+    if (this.busySurface) return void this.nextSurface.set(name, [name, code, asked]);
     this.busySurface = true;
     this.worker.postMessage({ do: "surface", name, threshold: code, asked });
   }
@@ -379,36 +596,64 @@ class App {
     this.dimensions();
   }
 
+  // Of the chosen contact; of the target where that was not carved.
+  get castName() { return this.volumes[this.contact?.volume] ? this.contact.volume : "main"; }
+
   castLines(view) {
-    const key = view.stamp + view.rev;
+    const key = `${this.castName} ${view.stamp} ${view.rev}`;
     if (!this.casts.has(key)) {
       this.casts.set(key, null);
-      this.worker.postMessage({ do: "cast", name: "main", key, P: view.P, rows: view.rows, cols: view.cols });
+      this.worker.postMessage({ do: "cast", name: this.castName, key, P: view.P, rows: view.rows, cols: view.cols });
     }
     return this.casts.get(key);
   }
 
+  async fetchTruth() {
+    const { rev } = this.scene.meshes.truth;
+    if (this.truthRev === rev) return;
+    this.truthRev = rev;
+    try { this.solid.truth(JSON.parse(await (await this.loader.get(`api/surface-of/truth/${rev}.json`)).text())); } catch { this.truthRev = undefined; }
+    $("truth-row").hidden = this.truthRev === undefined;
+  }
+
+  // Of the chosen contact: what was measured, with the truth, the surface at the threshold, and a second run.
   dimensions() {
-    const d = this.scene.dimensions, t = this.scene.truth, m = this.surfaceMeasures, table = $("dimensions");
+    const c = this.contact, target = !c || c.volume === "main";
+    const d = target ? this.scene.dimensions ?? c?.dimensions : c.dimensions;
+    const t = target ? this.scene.truth : null, m = target ? this.surfaceMeasures : null;
+    const o = this.scene.other ? this.scene.other.dimensions : null, table = $("dimensions");
     table.replaceChildren();
-    const row = (cells, tag = "td") => {
+    const row = (cells, head) => {
       const tr = table.insertRow();
-      for (const text of cells) tr.append(Object.assign(document.createElement(tag), { textContent: text }));
+      cells.forEach((cell, i) => {
+        const [text, mark] = Array.isArray(cell) ? cell : [cell];
+        tr.append(Object.assign(document.createElement(head && text || (!head && !i && text) ? "th" : "td"), { textContent: text, className: mark ?? "", scope: head ? "col" : "row" }));
+      });
     };
-    row(["", "found, 95 %", ...(t ? ["truth"] : []), ...(m?.object ? ["surface here"] : [])], "th");
-    const names = [["length_m", "Length", "m"], ["width_m", "Width", "m"], ["height_m", "Height", "m"], ["volume_m3", "Volume", "m³"]];
-    for (const [key, label, unit] of names) {
-      const v = d?.[key], i = d?.intervals?.[key], digits = unit === "m" ? 2 : 3;
+    if (!d && !m) return void row(["", c?.reason ?? (this.scene.volumes.main ? "carved; not measured yet" : this.scene.status || "nothing carved yet")]);
+    row(["", "found, 95 %", ...(t ? ["truth"] : []), ...(m?.object ? ["surface here"] : []), ...(o ? ["run B", "B − A"] : [])], true);
+    const deg = 1 / RAD, half = (one, key) => (one?.intervals?.[key] ? (one.intervals[key][1] - one.intervals[key][0]) / 2 : undefined);
+    const told = (v, i, digits, unit) => (v === undefined || v === null ? "—" : `${v.toFixed(digits)}${i === undefined ? "" : ` ± ${i.toFixed(digits)}`} ${unit}`);
+    const names = [["length_m", "Length", "m", 2, 1], ["width_m", "Width", "m", 2, 1], ["height_m", "Height", "m", 2, 1], ["volume_m3", "Volume", "m³", 3, 1], ["heading_rad", "Heading", "°", 1, deg]];
+    for (const [key, label, unit, digits, by] of names) {
+      const v = d?.[key], i = half(d, key);
       if (v === undefined && !m?.object) continue;
-      const found = v === undefined || v === null ? "—" : `${v.toFixed(digits)}${i ? ` ± ${((i[1] - i[0]) / 2).toFixed(digits)}` : ""} ${unit}`;
-      row([label, found, ...(t ? [t[key] === undefined ? "" : `${t[key].toFixed(digits)} ${unit}`] : []), ...(m?.object ? [`${m[key].toFixed(digits)} ${unit}`] : [])]);
-    }
-    if (d?.heading_rad !== undefined) {
-      const i = d.intervals?.heading_rad, deg = 180 / Math.PI;
-      row(["Heading", `${(d.heading_rad * deg).toFixed(1)}${i ? ` ± ${(((i[1] - i[0]) / 2) * deg).toFixed(1)}` : ""} °`]);
+      if (key === "heading_rad" && v === undefined) continue;
+      const cells = [label, told(v === undefined || v === null ? v : v * by, i === undefined ? i : i * by, digits, unit)];
+      if (t) cells.push(t[key] === undefined || t[key] === null ? "" : told(t[key] * by, undefined, digits, unit));
+      if (m?.object) cells.push(m[key] === undefined ? "" : told(m[key], undefined, digits, unit));
+      if (o) {
+        cells.push(told(o[key] === undefined ? undefined : o[key] * by, half(o, key) === undefined ? undefined : half(o, key) * by, digits, unit));
+        let off = (o[key] ?? NaN) - v;
+        if (key === "heading_rad") off = Math.atan2(Math.sin(2 * off), Math.cos(2 * off)) / 2; // an object has no front
+        // Two independent 95 % intervals: theirs of the difference.
+        const both = i === undefined || half(o, key) === undefined ? undefined : Math.hypot(i, half(o, key));
+        cells.push(Number.isFinite(off) ? [`${off > 0 ? "+" : ""}${(off * by).toFixed(digits)} ${unit}`, both !== undefined && Math.abs(off) > both ? "differs" : "agrees"] : "—");
+      }
+      row(cells);
     }
     if (m && !m.object) row(["", "no object at this threshold"]);
-    if (!d && !m) row(["", this.scene.status || "nothing carved yet"]);
+    $("why-here").hidden = !m?.object;
   }
 
   // Controls
@@ -419,9 +664,21 @@ class App {
     check("contour");
     check("cast");
     check("compare", () => ($("tag-other").hidden = !s.compare));
+    check("overlay");
+    check("truth");
+    check("follow");
+    for (const [id, key] of [["section", "section"], ["cut", "cut"]]) {
+      $(id).value = s[key];
+      $(id).oninput = $(id).onchange = () => { s[key] = key === "cut" ? +$(id).value : $(id).value; $("cut").hidden = s.section === "off"; this.save(); this.solid?.dirty(); };
+    }
+    $("cut").hidden = s.section === "off";
+    for (const name of ["main", "other"]) $(`auto-${name}`).onclick = () => { delete s.thresholds[this.volumes[name]?.method]; $(`threshold-${name}`).value = this.auto[name]; this.threshold(name, this.auto[name]); this.save(); };
+    press("zoom-contact", () => this.zoomToContact());
+    press("report", () => this.download("api/report.pdf?contact=" + encodeURIComponent(this.contact?.id ?? "")));
+    press("save-circle", () => this.download(`api/circle.gif?contact=${encodeURIComponent(this.contact?.id ?? "")}&set=${this.panels[1].isView && !isOther(this.panels[1].layer) ? this.panels[1].layer : "shadow"}`));
     check("evidence", () => { if (s.evidence) for (const n of Object.keys(this.volumes)) this.threshold(n, +$(`threshold-${n}`).value); });
     $("tag-other").hidden = !s.compare;
-    $("whole").onchange = () => this.solid?.whole($("whole").checked);
+    $("whole").onchange = () => { this.solid?.whole($("whole").checked); if (!$("whole").checked) this.desk.goTo3d(); };
     press("play", () => this.play());
     press("orientation", () => this.turn());
     press("ruler", () => this.rule());
@@ -429,7 +686,7 @@ class App {
     press("help-open", () => $("help").showModal());
     press("save-picture", () => this.savePicture());
     press("copy-link", () => this.copyLink());
-    press("save-html", () => this.download("api/export.html?step=2"));
+    press("save-html", () => this.download(`api/export.html?step=2`));
     $("save-mesh").onchange = () => { const kind = $("save-mesh").value; if (kind && this.surfaceMeasures && !this.surfaceMeasures.object) $("measured").textContent = "No object at this threshold: no mesh to save."; else if (kind) this.download(`api/mesh/main.${kind}${this.thresholdQuery ?? ""}`); $("save-mesh").value = ""; };
     for (const [id, key] of [["top-db", "top"], ["range-db", "range"]]) {
       const input = $(id);
@@ -446,6 +703,9 @@ class App {
       (pressed?.querySelector("input[type=checkbox]") ?? pressed)?.blur();
     });
     addEventListener("hashchange", () => location.reload());
+    const sized = () => { const em = parseFloat(getComputedStyle(document.documentElement).fontSize) / 13; for (const p of this.panels) if (p.slider.em !== em) { p.slider.em = em; p.slider.resize(); } };
+    addEventListener("resize", sized);
+    sized();
   }
 
   // No code is darker than the lowest: a range beyond it would be a lie.
@@ -467,16 +727,25 @@ class App {
 
   key(e) {
     if ($("help").open || e.ctrlKey || e.metaKey) return;
-    const typing = e.target.matches?.("input:not([type=checkbox]), select");
+    const typing = e.target.matches?.("input:not([type=checkbox]), select, textarea"), writing = e.target.matches?.("textarea, input[type=text]");
+    if (writing) return;
     const pan = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[e.key];
     const done = () => e.preventDefault();
-    const digit = /^Digit([1-6])$/.exec(e.code);
+    const digit = /^Digit([1-9])$/.exec(e.code);
     const at = (id, by) => { const i = $(id); i.value = +i.value + by; i.oninput({ target: i }); };
     if (pan && e.altKey) { this.moveBy(...this.onScreen(pan, 0.1)); this.save(); return done(); }
     if (typing && (pan || e.key === " " || e.key === "Home" || e.key === "End" || e.key.startsWith("Page"))) return;
-    if (pan && this.state.ruling && this.state.ruler) { const [x, y] = this.onScreen(pan, 0.005); this.state.ruler[1] = [this.state.ruler[1][0] + x, this.state.ruler[1][1] + y]; this.dirty(); return done(); }
-    const press = { n: "orientation", r: "ruler", 0: "fit", s: "save-picture", l: "copy-link", c: "contour", m: "cast", b: "compare", v: "evidence", k: "whole", "?": "help-open" }[e.key.toLowerCase()];
-    if (digit && e.code !== "Digit0") { this.panels[e.shiftKey ? 0 : 1].choose(LAYERS[digit[1] - 1][0]); this.save(); return done(); }
+    if (pan && this.state.ruling) {
+      const ruler = this.rulersHere().includes(this.ruler) ? this.ruler : this.offeredRuler(), [x, y] = this.onScreen(pan, 0.005), [u, v] = ruler.ends[1];
+      this.moveEnd(ruler, 1, [u + x, v + y]);
+      clearTimeout(this.rulerRest);
+      this.rulerRest = setTimeout(() => this.ruled(ruler), 500);
+      return done();
+    }
+    const press = { n: "orientation", r: "ruler", 0: "fit", s: "save-picture", l: "copy-link", c: "contour", m: "cast", b: "compare", v: "evidence", k: "whole", z: "zoom-contact", o: "overlay", "?": "help-open" }[e.key.toLowerCase()];
+    if (digit && LAYERS[digit[1] - 1]) { this.panels[e.shiftKey ? 0 : 1].choose(LAYERS[digit[1] - 1][0]); this.save(); return done(); }
+    if (e.key === "Delete" && this.ruler && this.rulersHere().includes(this.ruler)) { this.desk.dropRuler(this.ruler); return done(); }
+    if (e.key === "," || e.key === ".") { this.desk.step(e.key === "." ? 1 : -1); return done(); }
     if (press) { $(press).click(); return done(); }
     if (e.key === " " && e.target.tagName !== "BUTTON") { this.play(); return done(); }
     if (e.key === "+" || e.key === "=") return this.zoomBy(1.25), done();
@@ -513,31 +782,40 @@ class App {
 
   rule() {
     this.state.ruling = !this.state.ruling;
-    if (!this.state.ruling) this.state.ruler = null;
-    else {
-      // For the keyboard: along the shadow, from the target away from the sonar.
-      const view = this.current, c = this.scene.target?.centre ?? [0, 0], t = ((view?.aspect_deg ?? 0) * Math.PI) / 180;
-      this.state.ruler = [[c[0], c[1]], [c[0] - Math.cos(t), c[1] - Math.sin(t)]];
-    }
     $("ruler").setAttribute("aria-pressed", String(this.state.ruling));
-    if (!this.state.ruler) $("measured").textContent = "";
     this.dirty();
+  }
+
+  // For the keyboard: along the shadow, from the contact away from the sonar.
+  offeredRuler() {
+    const view = this.current, c = this.place?.centre ?? [0, 0], t = Math.atan2(c[1] - (view?.sonar[1] ?? 0), c[0] - (view?.sonar[0] ?? 0));
+    return this.newRuler([c[0], c[1]], [c[0] + Math.cos(t), c[1] + Math.sin(t)]);
   }
 
   fit() { Object.assign(this.state, { zoom: 1, centre: [0, 0] }); this.save(); this.dirty(); }
 
+  // Drawn anew, as large as the views are worth: not what the screen happens to show.
   savePicture() {
-    const p = this.panels[1], canvas = p.slider.picture, out = new OffscreenCanvas(canvas.width, canvas.height + 26), g = out.getContext("2d");
+    const p = this.panels[1], slider = p.slider, px = SAVED_PX, k = px / slider.side, line = Math.round(px / 40);
+    const out = new OffscreenCanvas(px, px + 2 * line), g = out.getContext("2d"), one = new OffscreenCanvas(px, px);
+    p.paint({ canvas: one, side: px, radius: p.radius * k, k: k * slider.em });
     g.fillStyle = "#0b0f12"; g.fillRect(0, 0, out.width, out.height);
-    g.drawImage(canvas, 0, 0); g.drawImage(p.slider.ring, 0, 0);
-    g.fillStyle = "#c9d3d9"; g.font = "13px sans-serif";
-    g.fillText(`${p.select.selectedOptions[0].text} · ${$("where").textContent}`, 8, out.height - 8, out.width - 16);
+    g.drawImage(one, 0, 0);
+    if (!p.six) {
+      const ring = new OffscreenCanvas(px, px);
+      slider.paintRing(ring.getContext("2d"), px, k);
+      g.drawImage(ring, 0, 0);
+    }
+    g.fillStyle = "#c9d3d9"; g.font = `${Math.round(px / 58)}px sans-serif`;
+    g.fillText(`${this.scene.title} · ${p.select.selectedOptions[0].text} · ${$("where").textContent}`, line, px + 1.3 * line, px - 2 * line);
     out.convertToBlob({ type: "image/png" }).then((blob) => {
       const url = URL.createObjectURL(blob);
-      this.download(url, `${p.layer}_${Math.round(this.current?.aspect_deg ?? 0)}.png`);
+      this.download(url, `${this.fileName()}_${p.layer}_${Math.round(this.current?.aspect_deg ?? 0)}.png`);
       setTimeout(() => URL.revokeObjectURL(url), 10000);
     });
   }
+
+  fileName() { return (this.scene.title || "csas").replace(/[^A-Za-z0-9._-]+/g, "_"); }
 
   async copyLink() {
     history.replaceState(null, "", this.link());

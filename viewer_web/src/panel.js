@@ -9,8 +9,16 @@ export const LAYERS = [
   ["reduced", "Reduced aperture"],
   ["multilook", "Multi-look"],
   ["color_by_aspect", "Colour by aspect"],
+  ["six_sub_aperture", "Six sub-apertures"],
+  ["six_shadow", "Six shadow-enhanced"],
 ];
-const VIEWS = new Set(["sub_aperture", "shadow", "likelihood", "reduced"]);
+// Of a second run that is compared with: offered where there is one.
+export const OTHER_LAYERS = [["b.sub_aperture", "B: sub-aperture"], ["b.shadow", "B: shadow-enhanced"], ["b.likelihood", "B: likelihood"]];
+const VIEWS = new Set(["sub_aperture", "shadow", "likelihood", "reduced", ...OTHER_LAYERS.map(([name]) => name)]);
+// Of figures 3 and 6 of the paper.
+const SIX_DEG = [0, 60, 120, 180, 240, 300];
+export const isOther = (layer) => layer.startsWith("b.");
+export const COLOURS = { outline: "#ffb347", cast: "#4fd1e8", ruler: "#ffe14d", pick: "#ff7ad9", sonar: "#29d85a" };
 
 export function inverse(A) {
   const [a, b, c, d, e, f] = A, det = a * e - b * d;
@@ -33,20 +41,30 @@ export class Panel {
     this.app = app;
     this.layer = layer;
     this.chosen = app.linkedLayers; // by hand, or by a link: not by what there is
-    place.innerHTML = `<div class="row"><label>${label} <select aria-label="Layer, ${label}"></select></label><span class="about"></span></div><div class="dial"><csas-slider label="Aspect, ${label} picture"></csas-slider><div class="note"></div></div>`;
+    place.innerHTML = `<div class="row"><label>${label} <select aria-label="Layer, ${label}"></select></label><span class="about"></span></div><div class="dial"><csas-slider label="Aspect, ${label} picture"></csas-slider><div class="note"></div><div class="empty" role="status"></div></div><div class="scale"><span class="low"></span><canvas class="bar" width="255" height="1" role="img" aria-label="Levels from black to white"></canvas><span class="high"></span><span class="told"></span></div>`;
     this.select = place.querySelector("select");
     this.slider = place.querySelector("csas-slider");
     this.about = place.querySelector(".about");
     this.note = place.querySelector(".note");
+    this.empty = place.querySelector(".empty");
+    [this.low, this.bar, this.high, this.told] = [".low", ".bar", ".high", ".told"].map((c) => place.querySelector(c));
+    this.slider.takesTouch = (touch) => app.state.ruling || !!this.endAt(touch);
     this.select.append(...LAYERS.map(([value, text]) => new Option(text, value)));
     this.select.value = layer;
     this.select.onchange = () => this.choose(this.select.value);
-    this.slider.addEventListener("aspect", (e) => app.setAspect(e.detail.aspect, e.detail.when));
+    this.slider.addEventListener("aspect", (e) => app.setAspect(e.detail.aspect, e.detail.when, true));
     this.slider.addEventListener("resized", () => app.dirty());
     this.pointers();
   }
 
+  offer(layers) {
+    if (this.select.options.length === layers.length) return;
+    this.select.replaceChildren(...layers.map(([value, text]) => new Option(text, value)));
+    this.select.value = this.layer;
+  }
+
   choose(layer) {
+    if (![...this.select.options].some((o) => o.value === layer)) return;
     this.chosen = true;
     this.layer = this.select.value = layer;
     if (layer === "reduced") this.app.wantReduced();
@@ -55,12 +73,17 @@ export class Panel {
   }
 
   get isView() { return VIEWS.has(this.layer); }
+  get six() { return this.layer.startsWith("six_") ? this.layer.slice(4) : ""; }
   get radius() { return this.slider.disc; }
+  // What is drawn on: side and radius in the canvas's pixels, k of them a CSS pixel.
+  get frame() {
+    const { picture, side } = this.slider, k = picture.width / (side || 1);
+    return { canvas: picture, side: picture.width, radius: this.radius * k, k: k * this.slider.em };
+  }
 
   // Scene metres → canvas pixels, as (a, b, c, d, e, f) of x' = a x + c y + e, y' = b x + d y + f.
-  ground(view) {
-    const { state } = this.app, canvas = this.slider.picture, k = canvas.width / this.slider.side;
-    const scale = (this.radius / this.app.sceneRadius) * state.zoom * k, half = canvas.width / 2;
+  ground(view, frame = this.frame) {
+    const { state } = this.app, scale = (frame.radius / this.app.sceneRadius) * state.zoom, half = frame.side / 2;
     let c = [scale, 0], r = [0, -scale]; // along x: (1, 0), along y: (0, -1)
     if (state.orientation === "sonar" && view) {
       const t = view.aspect_deg * RAD;
@@ -69,6 +92,19 @@ export class Panel {
     }
     const [x, y] = state.centre;
     return [c[0], r[0], c[1], r[1], half - c[0] * x - c[1] * y, half - r[0] * x - r[1] * y];
+  }
+
+  onCanvas([x, y], T = this.ground(this.app.current)) { return [T[0] * x + T[2] * y + T[4], T[1] * x + T[3] * y + T[5]]; }
+
+  // Which end of a ruler is under a pointer: those of the view that is shown.
+  endAt(e) {
+    const box = this.slider.picture.getBoundingClientRect(), k = this.slider.picture.width / (this.slider.side || 1), T = this.ground(this.app.current);
+    const reach = (e.pointerType === "mouse" ? 9 : 22) * k * this.slider.em;
+    for (const ruler of this.app.rulersHere())
+      for (const end of [1, 0]) {
+        const [x, y] = this.onCanvas(ruler.ends[end], T);
+        if (Math.hypot(x - (e.clientX - box.left) * k, y - (e.clientY - box.top) * k) < reach) return { ruler, end };
+      }
   }
 
   toScene(e) {
@@ -80,17 +116,22 @@ export class Panel {
 
   pointers() {
     const { slider, app } = this, held = new Map();
+    let pressed, grip;
     slider.addEventListener("pointerdown", (e) => {
-      if (slider.onRing(e)) return;
+      if (slider.onRing(e) || this.six) return;
       slider.setPointerCapture(e.pointerId);
       held.set(e.pointerId, e);
-      if (app.state.ruling && held.size === 1) app.state.ruler = [this.toScene(e), this.toScene(e)];
+      pressed = held.size === 1 ? e : undefined;
+      grip = held.size === 1 ? this.endAt(e) : undefined;
+      if (grip) app.ruler = grip.ruler;
+      else if (app.state.ruling && held.size === 1) grip = { ruler: app.newRuler(this.toScene(e), this.toScene(e)), end: 1 };
       app.dirty();
     });
     slider.addEventListener("pointermove", (e) => {
       const before = held.get(e.pointerId);
       if (!before) return;
-      if (app.state.ruling && held.size === 1) app.state.ruler[1] = this.toScene(e);
+      if (pressed && Math.hypot(e.clientX - pressed.clientX, e.clientY - pressed.clientY) > 4) pressed = undefined;
+      if (grip && held.size === 1) app.moveEnd(grip.ruler, grip.end, this.toScene(e));
       else {
         if (held.size === 2) {
           const other = [...held.values()].find((h) => h.pointerId !== e.pointerId);
@@ -105,7 +146,13 @@ export class Panel {
       app.dirty();
     });
     for (const end of ["pointerup", "pointercancel"])
-      slider.addEventListener(end, (e) => { if (held.delete(e.pointerId)) app.save(); });
+      slider.addEventListener(end, (e) => {
+        if (!held.delete(e.pointerId)) return;
+        if (grip) app.ruled(grip.ruler);
+        else if (pressed && end === "pointerup") app.pickGround(this.toScene(e));
+        grip = pressed = undefined;
+        app.save();
+      });
     slider.addEventListener("wheel", (e) => {
       if (slider.onRing(e)) return;
       e.preventDefault();
@@ -116,6 +163,7 @@ export class Panel {
   // The picture to draw: the wanted view, or the nearest that is decoded meanwhile.
   find() {
     const { app, layer } = this;
+    if (this.six) return { view: app.current, bitmap: app.views(this.six).length ? true : undefined, exact: true, about: {} };
     if (!this.isView) {
       const about = app.scene.pictures[layer];
       const address = about && `api/picture/${layer}/${about.rev}.png`;
@@ -138,34 +186,86 @@ export class Panel {
   }
 
   draw() {
-    const { app, slider } = this, canvas = slider.picture, g = canvas.getContext("2d", { alpha: false });
-    if (!slider.side) return;
-    const found = this.find(), { about, bitmap, view } = found, k = canvas.width / slider.side, half = canvas.width / 2;
-    this.found = found;
+    if (!this.slider.side) return;
+    this.found = this.find();
+    this.paint(this.frame);
+    this.describe(this.found, this.found.view);
+  }
+
+  paint(frame) {
+    const g = frame.canvas.getContext("2d", { alpha: false });
     g.setTransform(1, 0, 0, 1, 0, 0);
     g.globalCompositeOperation = "source-over";
-    const T = this.ground(view);
-    const onto = (A) => {
+    if (this.six) this.paintSix(g, frame);
+    else this.paintOne(g, frame, this.found);
+  }
+
+  paintOne(g, frame, { about, bitmap, view }) {
+    const { app } = this, T = this.ground(view, frame), other = isOther(this.layer) ? app.offset : [0, 0];
+    // A second run's pictures are moved so that its contact lies where the first one's does.
+    const onto = (A, [dx, dy] = [0, 0]) => {
       const [a, b, c, d, e, f] = inverse(A); // pixel → ground
       g.setTransform(
         T[0] * a + T[2] * d, T[1] * a + T[3] * d, T[0] * b + T[2] * e, T[1] * b + T[3] * e,
-        T[0] * c + T[2] * f + T[4], T[1] * c + T[3] * f + T[5],
+        T[0] * (c + dx) + T[2] * (f + dy) + T[4], T[1] * (c + dx) + T[3] * (f + dy) + T[5],
       );
     };
-    if (bitmap?.codes) this.levels(g, bitmap, product(about.A, inverse(swapped(T))), this.radius * k);
+    const moved = [T[0], T[1], T[2], T[3], T[4] + T[0] * other[0] + T[2] * other[1], T[5] + T[1] * other[0] + T[3] * other[1]];
+    if (bitmap?.codes) this.levels(g, bitmap, product(about.A, inverse(swapped(moved))), frame.radius);
     else {
       g.fillStyle = "#000";
-      g.fillRect(0, 0, canvas.width, canvas.width);
+      g.fillRect(0, 0, frame.side, frame.side);
       if (bitmap) {
-        onto(about.A);
+        onto(about.A, other);
         g.drawImage(bitmap, -0.5, -0.5);
       }
     }
-    if (view && app.state.contour) this.outline(g, onto, view);
-    if (view && app.state.cast) this.castOf(g, onto, view);
+    if (view && app.state.contour && bitmap) this.outline(g, (A) => onto(A, other), view, isOther(this.layer) ? "b." : "");
+    if (view && app.state.cast && !isOther(this.layer)) this.castOf(g, onto, view);
     g.setTransform(1, 0, 0, 1, 0, 0);
-    this.furniture(g, T, view, k, half);
-    this.describe(found, view);
+    this.furniture(g, T, view, frame);
+  }
+
+  // Six views at once, every 60°: each as the large picture lies.
+  paintSix(g, frame) {
+    const { app } = this, set = this.six, views = app.views(set), { side, k } = frame;
+    g.fillStyle = "#12181d";
+    g.fillRect(0, 0, side, side);
+    const cell = Math.floor(Math.min(side / 3, (side - 40 * k) / 2)), radius = cell / 2 - 3 * k, top = (side - 2 * cell) / 2 - 6 * k;
+    const tile = (this.tile ??= new OffscreenCanvas(1, 1));
+    tile.width = tile.height = cell;
+    const tg = tile.getContext("2d", { alpha: false }), small = { canvas: tile, side: cell, radius, k };
+    this.sixWanted = [];
+    if (views.length) SIX_DEG.forEach((aspect, i) => {
+      const view = views[app.nearestOf(views, aspect)], address = app.address(set, view, "jpg"), bitmap = app.loader.bitmap(address);
+      this.sixWanted.push(address);
+      const x = (i % 3) * cell, y = top + Math.floor(i / 3) * (cell + 14 * k);
+      tg.setTransform(1, 0, 0, 1, 0, 0);
+      tg.fillStyle = "#000";
+      tg.fillRect(0, 0, cell, cell);
+      const T = this.ground(view, small);
+      if (bitmap?.codes) this.levels(tg, bitmap, product(view.A, inverse(swapped(T))), radius);
+      if (app.state.contour) {
+        const onto = (A) => {
+          const [a, b, c, d, e, f] = inverse(A);
+          tg.setTransform(T[0] * a + T[2] * d, T[1] * a + T[3] * d, T[0] * b + T[2] * e, T[1] * b + T[3] * e, T[0] * c + T[2] * f + T[4], T[1] * c + T[3] * f + T[5]);
+        };
+        this.outline(tg, onto, view, "");
+      }
+      g.save();
+      g.beginPath();
+      g.arc(x + cell / 2, y + cell / 2, radius, 0, 7);
+      g.clip();
+      g.drawImage(tile, x, y);
+      g.restore();
+      g.strokeStyle = "#8697a3"; g.lineWidth = k;
+      g.beginPath(); g.arc(x + cell / 2, y + cell / 2, radius, 0, 7); g.stroke();
+      g.font = `${11 * k}px system-ui, sans-serif`; g.textAlign = "center"; g.fillStyle = "#c9d3d9";
+      g.fillText(`${view.aspect_deg.toFixed(0)}°`, x + cell / 2, y + cell + 9 * k);
+      // Where the sonar is.
+      const t = view.aspect_deg * RAD, s = Math.hypot(T[0], T[1]), d = [T[0] * Math.cos(t) + T[2] * Math.sin(t), T[1] * Math.cos(t) + T[3] * Math.sin(t)].map((v) => v / s);
+      g.beginPath(); g.arc(x + cell / 2 + (radius - 6 * k) * d[0], y + cell / 2 + (radius - 6 * k) * d[1], 4 * k, 0, 7); g.fillStyle = COLOURS.sonar; g.fill();
+    });
   }
 
   // Grey of each level: from lo to hi dB it goes from black to white.
@@ -186,8 +286,10 @@ export class Panel {
   // Levels where the screen wants them, between their four neighbours, as greys. M: canvas → picture pixels.
   levels(g, { codes, width, height }, [a, b, c, d, e, f], radius) {
     const side = g.canvas.width, half = side / 2, { grey } = this;
-    if (this.screen?.width !== side) this.screen = new ImageData(side, side);
-    const out = new Uint32Array(this.screen.data.buffer).fill(0xff000000);
+    this.screens ??= new Map();
+    if (this.screens.size > 3) this.screens.clear();
+    if (!this.screens.has(side)) this.screens.set(side, new ImageData(side, side));
+    const screen = this.screens.get(side), out = new Uint32Array(screen.data.buffer).fill(0xff000000);
     const first = Math.max(0, Math.floor(half - radius)), last = Math.min(side - 1, Math.ceil(half + radius));
     // In 1/65536 pixels: whole numbers are what makes this fast.
     const [a1, d1] = [a, d].map((n) => Math.round(n * 65536)), [right, below] = [(width - 1) * 65536, (height - 1) * 65536];
@@ -206,12 +308,12 @@ export class Panel {
         out[at] = grey[((upper << 8) + (lower - upper) * q) >> 16];
       }
     }
-    g.putImageData(this.screen, 0, 0);
+    g.putImageData(screen, 0, 0);
   }
 
-  outline(g, onto, view) {
-    const { app } = this, mask = app.sameStamp("shadow_mask", view);
-    const lines = mask && app.loader.lines(`api/contour/${mask.stamp}/${mask.rev}.json`);
+  outline(g, onto, view, run) {
+    const { app } = this, mask = app.sameStamp(`${run}shadow_mask`, view);
+    const lines = mask && app.loader.lines(app.contourAddress(run, mask));
     if (!lines) return;
     onto(mask.A);
     g.beginPath();
@@ -220,7 +322,7 @@ export class Panel {
       for (let i = 2; i < line.length; i += 2) g.lineTo(line[i], line[i + 1]);
       g.closePath();
     }
-    this.stroke(g, "#ffb347", 1.6);
+    this.stroke(g, COLOURS.outline, 1.6);
   }
 
   castOf(g, onto, view) {
@@ -229,7 +331,7 @@ export class Panel {
     onto(view.A);
     g.beginPath();
     for (let i = 0; i < lines.length; i += 4) { g.moveTo(lines[i], lines[i + 1]); g.lineTo(lines[i + 2], lines[i + 3]); }
-    this.stroke(g, "#4fd1e8", 1.6);
+    this.stroke(g, COLOURS.cast, 1.6);
   }
 
   stroke(g, colour, width) {
@@ -240,8 +342,8 @@ export class Panel {
     g.stroke();
   }
 
-  furniture(g, T, view, k, half) {
-    const { app } = this, r = this.radius * k, scale = Math.hypot(T[0], T[1]);
+  furniture(g, T, view, { side, radius: r, k }) {
+    const { app } = this, half = side / 2, scale = Math.hypot(T[0], T[1]);
     const at = ([x, y]) => [T[0] * x + T[2] * y + T[4], T[1] * x + T[3] * y + T[5]];
     g.font = `${12 * k}px system-ui, sans-serif`;
     g.textAlign = "center";
@@ -257,7 +359,7 @@ export class Panel {
     line(5, "#000b"); line(2.5, "#fff");
     written(length < 1 ? `${Math.round(length * 100)} cm` : `${length} m`, half, half + 0.86 * r - 6 * k, "#fff");
     // North, and where the sonar is.
-    const n = [T[2] / scale, T[3] / scale], nx = half - 0.62 * r, ny = half - 0.62 * r;
+    const tn = (90 + app.north) * RAD, n = [0, 1].map((i) => (T[i] * Math.cos(tn) + T[i + 2] * Math.sin(tn)) / scale), nx = half - 0.62 * r, ny = half - 0.62 * r;
     g.beginPath(); g.moveTo(nx - 12 * k * n[0], ny - 12 * k * n[1]); g.lineTo(nx + 12 * k * n[0], ny + 12 * k * n[1]);
     g.lineWidth = 2 * k; g.strokeStyle = "#fff"; g.stroke();
     written("N", nx + 21 * k * n[0], ny + 21 * k * n[1] + 4 * k, "#fff");
@@ -269,30 +371,80 @@ export class Panel {
       g.lineTo(tip[0] - 12 * k * d[0] - 5 * k * d[1], tip[1] - 12 * k * d[1] + 5 * k * d[0]);
       g.fillStyle = "#29d85a"; g.fill();
     }
-    const ruler = app.state.ruler;
-    if (ruler) {
-      const [a, b] = ruler.map(at);
-      for (const [w, c] of [[4, "#000b"], [2, "#ffb347"]]) {
+    // Contacts, by their numbers.
+    for (const c of app.scene.contacts ?? []) {
+      const [x, y] = at(c.position_m), chosen = c.id === app.state.contact;
+      if (Math.hypot(x - half, y - half) > r || app.scene.contacts.length < 2) continue;
+      const d = 5 * k;
+      g.lineWidth = (chosen ? 2 : 1) * k; g.strokeStyle = chosen ? COLOURS.sonar : "#dfe7ec";
+      g.beginPath(); g.moveTo(x - d, y); g.lineTo(x + d, y); g.moveTo(x, y - d); g.lineTo(x, y + d); g.stroke();
+      written(c.name.replace("Contact ", ""), x + 9 * k, y - 6 * k, chosen ? COLOURS.sonar : "#dfe7ec");
+    }
+    for (const ruler of app.rulersHere()) {
+      const [a, b] = ruler.ends.map(at), told = app.measured(ruler);
+      for (const [w, c] of [[4, "#000b"], [ruler === app.ruler ? 2.4 : 1.4, told.height === undefined ? "#c9d3d9" : COLOURS.ruler]]) {
+        g.setLineDash(told.height === undefined ? [5 * k, 4 * k] : []);
         g.beginPath(); g.moveTo(...a); g.lineTo(...b); g.lineWidth = w * k; g.strokeStyle = c; g.stroke();
-        for (const p of [a, b]) { g.beginPath(); g.arc(...p, 3.5 * k, 0, 7); g.stroke(); }
+        g.setLineDash([]);
+        for (const p of [a, b]) { g.beginPath(); g.arc(...p, 4.5 * k, 0, 7); g.stroke(); }
+      }
+      written(told.height === undefined ? `${told.distance.toFixed(2)} m` : `h ${told.height.toFixed(2)} m`, b[0], b[1] + 18 * k, COLOURS.ruler);
+    }
+    const pick = view && app.pickedGround(view);
+    if (pick) {
+      const [x, y] = at(pick), d = 8 * k;
+      for (const [w, c] of [[4, "#000b"], [2, COLOURS.pick]]) {
+        g.lineWidth = w * k; g.strokeStyle = c;
+        g.beginPath(); g.moveTo(x - d, y - d); g.lineTo(x + d, y + d); g.moveTo(x - d, y + d); g.lineTo(x + d, y - d); g.stroke();
       }
     }
+  }
+
+  // The grey bar under the picture, in dB over the view's median, or what the colours mean.
+  scale() {
+    const { top, range } = this.app.state, name = this.layer;
+    const kind = name.endsWith("likelihood") ? "likelihood" : name === "color_by_aspect" ? "hue" : "level", key = `${kind} ${top} ${range}`;
+    if (this.scaled === key) return;
+    this.scaled = key;
+    const g = this.bar.getContext("2d");
+    for (let i = 0; i < 255; i++) {
+      g.fillStyle = kind === "hue" ? `hsl(${(360 * i) / 255} 100% 50%)` : `rgb(${i},${i},${i})`;
+      g.fillRect(i, 0, 1, 1);
+    }
+    [this.low.textContent, this.high.textContent, this.told.textContent] = {
+      level: [`${top - range} dB`, `${top > 0 ? "+" : ""}${top} dB`, "over the view's median"],
+      likelihood: ["shadow 0", "1 none", "blue: unknown"],
+      hue: ["aspect 0°", "360°", "grey: from all sides"],
+    }[kind];
   }
 
   describe(found, view) {
     const { app } = this, name = this.layer;
     let text = "";
-    if (!this.isView) text = found.about ? "all aspects" : "not there yet";
+    if (this.six) text = "every 60°";
+    else if (!this.isView) text = found.about ? "all aspects" : "not there yet";
     else if (!found.about) text = name === "reduced" && app.scene.reduced === false ? "needs the full-circle image" : "no view yet";
     else text = `${found.about.aperture_deg.toFixed(1).replace(/\.0$/, "")}° wide`;
     if (this.about.textContent !== text) this.about.textContent = text;
     const note = this.isView && found.about ? `${view.aspect_deg.toFixed(1)}°${found.late ? " (nearest)" : found.exact ? "" : " ·"}` : "";
     if (this.note.textContent !== note) this.note.textContent = note;
+    const empty = found.bitmap ? "" : app.awaited(this);
+    if (this.empty.textContent !== empty) this.empty.textContent = empty;
+    this.scale();
     const views = app.views(this.isView && app.views(name).length ? name : app.guide);
     const shown = found.view ? views.findIndex((v) => v.stamp === found.view.stamp) : -1;
     // Hue by aspect, as the picture has it.
     const turn = app.state.orientation === "sonar" && view ? view.aspect_deg - 90 : 0;
     this.slider.wheel = name === "color_by_aspect" ? turn : undefined;
+    if (this.slider.bare !== !!this.six) {
+      this.slider.bare = !!this.six;
+      this.slider.ring.style.visibility = this.six ? "hidden" : "visible";
+    }
+    this.slider.turns = app.state.orientation === "sonar";
+    const rings = !this.six && !isOther(name);
+    this.slider.turn = this.slider.turns && view ? 90 - view.aspect_deg : 0;
+    this.slider.north = app.north;
+    this.slider.evidence = rings ? app.evidence : undefined;
     this.slider.show(app.aspectsOf(views), app.stepOf(views), shown >= 0 ? shown : app.nearestOf(views));
   }
 }

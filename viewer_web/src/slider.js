@@ -1,12 +1,17 @@
 // <csas-slider>: a circle that stands for the sonar's track, with the picture inside. Aspects count
-// counter-clockwise from the right (east), as on the chart.
+// counter-clockwise from the right (east), as on the chart; the numbers round it are true bearings.
 const TAU = 2 * Math.PI;
+const RED = [255, 92, 72], GREEN = [96, 190, 150];
 
 export class CsasSlider extends HTMLElement {
   aspects = []; // degrees, ascending, of the views that are there
   step = 1; // degrees between them
   index = -1;
   wheel = undefined; // degrees that the wheel of hues is turned by; undefined: there is none
+  turn = 0; // degrees that the circle is turned by, counter-clockwise: it lies as the picture does
+  north = 0; // degrees of true north from the scene's +y, counter-clockwise
+  evidence = undefined; // { heights: [[aspect, m, unexplained, lit]], median, rejected: [[aspect, reason]] }
+  em = 1; // size of the text over 13 px
 
   connectedCallback() {
     if (this.picture) return;
@@ -16,23 +21,33 @@ export class CsasSlider extends HTMLElement {
     this.setAttribute("role", "slider");
     this.setAttribute("aria-valuemin", "0");
     this.setAttribute("aria-valuemax", "360");
+    this.setAttribute("aria-valuenow", "0");
     this.setAttribute("aria-label", this.getAttribute("label") ?? "Aspect");
     new ResizeObserver(() => this.resize()).observe(this);
     this.addEventListener("pointerdown", (e) => {
       if (!this.onRing(e)) return;
       this.setPointerCapture(e.pointerId);
       this.dragging = e.pointerId;
-      this.point(e);
+      // A circle that turns with the picture is taken hold of: what is under the pointer stays there.
+      this.held = { angle: this.polar(e)[1], aspect: this.aspects[this.index] ?? 0, x: e.clientX, y: e.clientY, moved: false };
+      if (!this.turns) this.point(e);
       e.stopImmediatePropagation();
       this.focus({ preventScroll: true });
       e.preventDefault();
     });
     this.addEventListener("pointermove", (e) => {
-      if (this.dragging === e.pointerId) this.point(e);
+      if (this.dragging === e.pointerId) this.drag(e);
       else this.style.cursor = this.onRing(e) ? "grab" : "default";
     });
     for (const end of ["pointerup", "pointercancel"])
-      this.addEventListener(end, () => (this.dragging = undefined));
+      this.addEventListener(end, (e) => {
+        if (this.dragging === e.pointerId && this.turns && !this.held.moved && end === "pointerup") this.point(e);
+        this.dragging = undefined;
+      });
+    // One finger scrolls the page past the pictures (app.css), but on the circle, and two of them, are ours.
+    this.addEventListener("touchstart", (e) => {
+      if (e.touches.length > 1 || this.takesTouch?.(e.touches[0]) || this.onRing(e.touches[0])) e.preventDefault();
+    }, { passive: false });
     this.addEventListener("wheel", (e) => {
       if (!this.onRing(e)) return;
       e.preventDefault();
@@ -51,6 +66,12 @@ export class CsasSlider extends HTMLElement {
     });
   }
 
+  drag(e) {
+    if (!this.turns) return this.point(e);
+    if (Math.hypot(e.clientX - this.held.x, e.clientY - this.held.y) > 4) this.held.moved = true;
+    if (this.held.moved) this.choose(this.nearest(this.held.aspect - (this.polar(e)[1] - this.held.angle)), e.timeStamp);
+  }
+
   resize() {
     const ratio = Math.min(devicePixelRatio, 2);
     this.side = Math.min(this.clientWidth, this.clientHeight);
@@ -60,12 +81,14 @@ export class CsasSlider extends HTMLElement {
       c.style.left = `${(this.clientWidth - this.side) / 2}px`;
       c.style.top = `${(this.clientHeight - this.side) / 2}px`;
     }
+    this.background = undefined;
     this.drawRing();
     this.dispatchEvent(new CustomEvent("resized"));
   }
 
-  get radius() { return this.side / 2 - 15; } // of the circle, CSS pixels
-  get disc() { return this.side / 2 - 30; } // of the picture
+  // Of the circle and of the picture, CSS pixels; where there is no room for them, none.
+  get radius() { return Math.max(0, this.side / 2 - 24 * this.em); }
+  get disc() { return Math.max(0, this.radius - 18 * this.em); }
 
   polar(e) {
     const box = this.ring.getBoundingClientRect();
@@ -73,13 +96,13 @@ export class CsasSlider extends HTMLElement {
     return [Math.hypot(x, y), (((Math.atan2(y, x) / TAU) * 360) % 360 + 360) % 360, x, -y];
   }
 
-  onRing(e) { return this.polar(e)[0] > this.disc; }
-  point(e) { this.choose(this.nearest(this.polar(e)[1]), e.timeStamp); }
+  onRing(e) { const r = this.polar(e)[0]; return !this.bare && r > this.disc && r < this.side / 2; }
+  point(e) { this.choose(this.nearest(this.polar(e)[1] - this.turn), e.timeStamp); }
 
   nearest(aspect) {
     let best = -1, least = 1e9;
     this.aspects.forEach((a, i) => {
-      const off = Math.abs(((a - aspect + 540) % 360) - 180);
+      const off = Math.abs(((((a - aspect + 540) % 360) + 360) % 360) - 180);
       if (off < least) [least, best] = [off, i];
     });
     return best;
@@ -98,9 +121,9 @@ export class CsasSlider extends HTMLElement {
   }
 
   show(aspects, step, index) {
-    const same = this.aspects === aspects && this.step === step;
-    if (same && this.index === index && this.wheel === this.shownWheel) return;
-    Object.assign(this, { aspects, step, index, shownWheel: this.wheel });
+    const same = this.aspects === aspects && this.step === step && this.evidence === this.shownEvidence && this.north === this.shownNorth;
+    if (same && this.index === index && this.wheel === this.shownWheel && this.turn === this.shownTurn) return;
+    Object.assign(this, { aspects, step, index, shownWheel: this.wheel, shownTurn: this.turn, shownEvidence: this.evidence, shownNorth: this.north });
     if (index >= 0) {
       this.setAttribute("aria-valuenow", aspects[index].toFixed(2).replace(/\.?0+$/, ""));
       this.setAttribute("aria-valuetext", `aspect ${aspects[index].toFixed(1)} degrees`);
@@ -111,18 +134,29 @@ export class CsasSlider extends HTMLElement {
 
   drawRing() {
     const c = this.ring, size = c.width, k = size / (this.side || 1);
-    const g = c.getContext("2d");
-    if (!this.background || this.background.width !== size) {
-      this.background = new OffscreenCanvas(size, size);
-      this.drawCircle(this.background.getContext("2d"), size, k);
+    this.paintRing(c.getContext("2d"), size, k);
+  }
+
+  // Also on another canvas, larger than the screen's: the picture that is saved.
+  paintRing(g, size, k, background) {
+    background ??= this.background?.width === size ? this.background : undefined;
+    if (!background) {
+      background = new OffscreenCanvas(size, size);
+      this.drawCircle(background.getContext("2d"), size, k);
+      if (g.canvas === this.ring) this.background = background;
     }
+    g.setTransform(1, 0, 0, 1, 0, 0);
     g.clearRect(0, 0, size, size);
-    g.drawImage(this.background, 0, 0);
+    g.translate(size / 2, size / 2);
+    g.rotate((-this.turn / 360) * TAU);
+    g.drawImage(background, -size / 2, -size / 2);
+    g.setTransform(1, 0, 0, 1, 0, 0);
     if (this.wheel !== undefined) this.drawWheel(g, size, k);
+    this.drawDegrees(g, size, k);
     if (this.index < 0) return;
-    const a = (this.aspects[this.index] / 360) * TAU;
+    const a = ((this.aspects[this.index] + this.turn) / 360) * TAU;
     g.beginPath();
-    g.arc(size / 2 + this.radius * k * Math.cos(a), size / 2 - this.radius * k * Math.sin(a), 10 * k, 0, TAU);
+    g.arc(size / 2 + this.radius * k * Math.cos(a), size / 2 - this.radius * k * Math.sin(a), 9 * k * this.em, 0, TAU);
     g.fillStyle = "#29d85a";
     g.fill();
     g.lineWidth = 2 * k;
@@ -130,8 +164,23 @@ export class CsasSlider extends HTMLElement {
     g.stroke();
   }
 
+  // True bearings, clockwise from north.
+  drawDegrees(g, size, k) {
+    const r = (this.radius + 14 * this.em) * k, every = this.side < 300 ? 90 : 30;
+    g.font = `${10.5 * k * this.em}px system-ui, sans-serif`;
+    g.textAlign = "center";
+    g.textBaseline = "middle";
+    g.fillStyle = "#aab8c2";
+    for (let bearing = 0; bearing < 360; bearing += every) {
+      const a = ((90 + this.north - bearing + this.turn) / 360) * TAU;
+      const text = bearing % 90 ? String(bearing).padStart(3, "0") : "NESW"[bearing / 90];
+      g.fillText(text, size / 2 + r * Math.cos(a), size / 2 - r * Math.sin(a));
+    }
+    g.textBaseline = "alphabetic";
+  }
+
   drawWheel(g, size, k) {
-    const r = 24 * k, x = size - r - 6 * k, y = r + 6 * k;
+    const r = 22 * k * this.em, x = size - r - 2 * k, y = r + 2 * k;
     for (let d = 0; d < 360; d += 3) {
       g.beginPath();
       g.moveTo(x, y);
@@ -146,15 +195,18 @@ export class CsasSlider extends HTMLElement {
   }
 
   drawCircle(g, size, k) {
+    const em = this.em;
     // What lies outside of the picture's disc covers the picture: cheaper than clipping that, every time.
     g.fillStyle = "#12181d";
     g.beginPath();
-    g.rect(0, 0, size, size);
+    // Beyond the corners: the circle may be turned.
+    g.rect(-size, -size, 3 * size, 3 * size);
     g.arc(size / 2, size / 2, this.disc * k, 0, TAU);
     g.fill("evenodd");
     g.translate(size / 2, size / 2);
-    g.lineWidth = 5 * k;
-    g.strokeStyle = "#2a343c"; // no view here (yet)
+    if (this.evidence) this.drawEvidence(g, k);
+    g.lineWidth = 5 * k * em;
+    g.strokeStyle = "#333f48"; // no view here (yet)
     g.beginPath();
     g.arc(0, 0, this.radius * k, 0, TAU);
     g.stroke();
@@ -167,15 +219,51 @@ export class CsasSlider extends HTMLElement {
       g.arc(0, 0, this.radius * k, a - half, a + half);
     }
     g.stroke();
+    g.strokeStyle = "#e64fd0"; // rejected
+    g.beginPath();
+    for (const [aspect] of this.evidence?.rejected ?? []) {
+      const a = (-aspect / 360) * TAU;
+      g.moveTo(this.radius * k * Math.cos(a - half), this.radius * k * Math.sin(a - half));
+      g.arc(0, 0, this.radius * k, a - half, a + half);
+    }
+    g.stroke();
     g.lineWidth = k;
     g.strokeStyle = "#0b0f12";
     g.beginPath();
     for (let d = 0; d < 360; d += 10) {
-      const a = (d / 360) * TAU, r = d % 90 ? 2 : 4;
-      g.moveTo((this.radius - r) * k * Math.cos(a), (this.radius - r) * k * Math.sin(a));
-      g.lineTo((this.radius + r) * k * Math.cos(a), (this.radius + r) * k * Math.sin(a));
+      const a = ((d - this.north) / 360) * TAU, r = d % 90 ? 2 : 4;
+      g.moveTo((this.radius - r * em) * k * Math.cos(a), (this.radius - r * em) * k * Math.sin(a));
+      g.lineTo((this.radius + r * em) * k * Math.cos(a), (this.radius + r * em) * k * Math.sin(a));
     }
     g.stroke();
+  }
+
+  // A bar a view, inwards from the circle: half of the room is the run's median height; the redder, the more of
+  // the view's shadow is not explained by what was found, or lies on seabed that is lit.
+  drawEvidence(g, k) {
+    const { heights, median } = this.evidence, outer = this.radius - 4 * this.em, room = outer - this.disc - this.em;
+    const half = (this.step / 720) * TAU * 0.9;
+    for (const [aspect, height, unexplained, lit] of heights) {
+      if (!(median > 0)) break;
+      const a = (-aspect / 360) * TAU, inner = outer - room * Math.min(1, Math.max(0.08, height / (2 * median)));
+      const bad = Math.min(1, Math.max(unexplained ?? 0, lit ?? 0));
+      g.beginPath();
+      g.arc(0, 0, outer * k, a - half, a + half);
+      g.arc(0, 0, inner * k, a + half, a - half, true);
+      g.fillStyle = `rgb(${GREEN.map((v, i) => Math.round(v + bad * (RED[i] - v))).join()})`;
+      g.fill();
+    }
+  }
+
+  // What the evidence says of the view at an aspect, in words.
+  told(aspect) {
+    if (!this.evidence || aspect === undefined) return "";
+    const near = ([other]) => Math.abs(((((other - aspect + 540) % 360) + 360) % 360) - 180) < Math.max(0.05, this.step / 2);
+    const rejected = this.evidence.rejected.find(near);
+    if (rejected) return `not used: ${rejected[1]}`;
+    const found = this.evidence.heights.find(near);
+    if (!found) return "";
+    return `height ${found[1].toFixed(2)} m, ${Math.round(100 * (found[2] ?? 0))} % unexplained${found[3] > 0.005 ? `, ${Math.round(100 * found[3])} % lit` : ""}`;
   }
 }
 customElements.define("csas-slider", CsasSlider);
