@@ -543,6 +543,10 @@ def _replay_options(p: argparse.ArgumentParser) -> None:
         metavar="N",
         help="ROS domain, to look on: ROS_DOMAIN_ID=N ros2 topic list (default: one that nobody uses)",
     )
+    p.add_argument(
+        "--view", action="store_true", help="open the operator's page beside it; it stays until Ctrl-C"
+    )
+    p.add_argument("--no-browser", action="store_true", help="with --view: only print the address")
     _run_option(p, each=True)
     _bounded_objects(p)
     _results_options(p)
@@ -1050,6 +1054,8 @@ def _replay(arguments: argparse.Namespace, console: Console) -> int:
     from .process import replay_bag
 
     parameters = parameters_of(arguments)
+    port = _show_beside(console, browser=not arguments.no_browser) if arguments.view else None
+    newest: list[Path] = []
 
     def one(number: int | None, out: Path) -> tuple[int, dict[str, Any]]:
         with console.bar("views") as bar:
@@ -1070,15 +1076,48 @@ def _replay(arguments: argparse.Namespace, console: Console) -> int:
                 command=arguments.command_line,
                 progress=bar,
                 notice=console.notice,
+                viewer_port=port,
             )
         code = _give_report(console, out, report)
         if lacking := report.get("not_recorded"):
             told = "; ".join(lacking)
             print(f"{PROGRAM}: error: the recording is not whole: {told}", file=sys.stderr)
             code = max(code, FAILED)
+        newest[:] = [out]
         return code, report
 
-    return _each_run(arguments, one)
+    code = _each_run(arguments, one)
+    if port is not None and newest:
+        from .viewer import command
+
+        # At the same address: the page that followed the graph goes on with its results.
+        console.notice("the results are in the page now; Ctrl-C ends it")
+        command.view(newest[0], port=port, browser=False, say=lambda _: None)
+    return code
+
+
+def _show_beside(console: Console, *, browser: bool) -> int:
+    """Choose a port for the page of a graph that is about to start, tell it, and open it once it answers."""
+    import socket
+    import threading
+    import webbrowser
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = int(free.getsockname()[1])
+    url = f"http://127.0.0.1:{port}/"
+    console.notice(f"the graph is to be seen at {url}")
+
+    def wait() -> None:
+        for _ in range(600):  # a minute: a busy machine starts a graph in ten seconds
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0):
+                webbrowser.open(url)
+                return
+            time.sleep(0.1)
+
+    if browser:
+        threading.Thread(target=wait, daemon=True).start()
+    return port
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -157,6 +157,7 @@ def replay_bag(
     command: Sequence[str] = (),
     progress: Progress | None = None,
     notice: Notice = ignore,
+    viewer_port: int | None = None,
 ) -> dict[str, Any]:
     """Reconstruct the target of a bag through the node graph and write the same results folder.
 
@@ -169,6 +170,8 @@ def replay_bag(
         Views: times the recorded speed; 0: as fast as the nodes take them.
     domain_id : int, optional
         ROS domain, to look on with other tools; a free one otherwise.
+    viewer_port : int, optional
+        Show the graph in the operator's page, at this port of this machine.
 
     Returns
     -------
@@ -227,6 +230,9 @@ def replay_bag(
             },
             progress=progress or False,
             notice=notice,
+            beside=None
+            if viewer_port is None
+            else {"viewer": {"port": viewer_port, "method": p.carving.method}},
         )
         context.stage = "image" if replayed.stage == "sector" else replayed.stage
         if context.stage == "image":

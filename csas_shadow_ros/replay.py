@@ -383,6 +383,7 @@ def replay(
     notice: Callable[[str], None] | None = None,
     max_restarts: int = 3,
     stall_timeout_s: float = 180.0,
+    beside: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> ReplayResult:
     """Replay a bag through the node graph and return what it leaves.
 
@@ -421,6 +422,8 @@ def replay(
         How often each node may die.
     stall_timeout_s : float
         Give up when nothing at all has changed for so long.
+    beside : mapping of node name to mapping, optional
+        Further nodes, with their parameters, that only look on: `viewer`.
 
     Raises
     ------
@@ -449,6 +452,7 @@ def replay(
         of_stage = node_parameters(p, None if decision is None else decision.target, max_objects)
         plan = _node_plan(bag, chosen, of_stage, rate, recording, composites, window, overrides or {})
         plan["bag_player"]["bag_namespace"] = namespace or ""
+        plan |= {name: dict(own) for name, own in (beside or {}).items()}
         check(plan)
         domain = stack.enter_context(DomainReservation(domain_id))
         graph_id = new_graph_id()

@@ -180,7 +180,8 @@ def grid_of_file(path: Path, method: str) -> VoxelGrid:
         If it is damaged: any part of it may be what a broken disk or a full one left.
     """
     try:
-        with np.load(path) as data:
+        # Opened here: of a file that is none numpy would leave it open.
+        with path.open("rb") as file, np.load(file) as data:
             x, y, z = (float(v) for v in data["origin_m"])
             likelihood = data["likelihood"]
             volume = Volume((x, y, z), float(data["voxel_size_m"]), likelihood.shape)

@@ -217,7 +217,7 @@ class App {
     const ground = Math.hypot(view.sonar[0] - place.centre[0], view.sonar[1] - place.centre[1]);
     const shadow = (place.height * ground) / Math.max(0.1, view.sonar[2] - place.height);
     const reach = 1.15 * (place.size / 2 + shadow);
-    this.state.zoom = Math.min(40, Math.max(0.5, this.sceneRadius / reach));
+    this.state.zoom = Math.min(40, Math.max(1, this.sceneRadius / reach));
     this.state.centre = [place.centre[0], place.centre[1]];
     this.save();
     this.dirty();

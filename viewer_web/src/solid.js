@@ -1,6 +1,6 @@
 // The carved object in 3-D: one camera, one or two surfaces side by side.
 import {
-  AmbientLight, BoxGeometry, BufferAttribute, BufferGeometry, CanvasTexture, Color, DirectionalLight, DoubleSide, EdgesGeometry, Group, Line, LineBasicMaterial,
+  AmbientLight, BufferAttribute, BufferGeometry, CanvasTexture, Color, DirectionalLight, DoubleSide, Group, Line, LineBasicMaterial,
   LineLoop, LineSegments, Mesh, MeshBasicMaterial, MeshStandardMaterial, PerspectiveCamera, Plane, Points, PointsMaterial, Raycaster, Scene, SphereGeometry, Sprite,
   SpriteMaterial, Vector2, Vector3, WebGLRenderer,
 } from "three";
@@ -25,6 +25,17 @@ function seabedGrid() {
     }
   const lines = (list, color) => new LineSegments(new BufferGeometry().setAttribute("position", new BufferAttribute(new Float32Array(list), 3)), new LineBasicMaterial({ color }));
   return new Group().add(lines(fine, 0x222d35), lines(coarse, 0x3c4d59));
+}
+
+function boxLines(size) {
+  const [x, y, z] = size.map((v) => v / 2), list = [], corner = (i) => new Vector3(i & 1 ? x : -x, i & 2 ? y : -y, i & 4 ? z : -z);
+  for (let a = 0; a < 8; a++)
+    for (const bit of [1, 2, 4]) {
+      if (a & bit) continue;
+      const line = pieces(corner(a), corner(a | bit));
+      for (let i = 1; i < line.length; i++) list.push(line[i - 1], line[i]);
+    }
+  return new BufferGeometry().setFromPoints(list);
 }
 
 function label(text, colour = "#c9d3d9") {
@@ -263,7 +274,7 @@ export class Solid {
       side.box.visible = !!target;
       if (target) {
         side.box.geometry.dispose();
-        side.box.geometry = new EdgesGeometry(new BoxGeometry(...target.size));
+        side.box.geometry = boxLines(target.size);
         side.box.position.set(...target.centre);
       }
     }
