@@ -175,6 +175,7 @@ class App {
       this.desk.show();
       this.dimensions();
       if (name === "other") {
+        if (this.scene.other) $("title").textContent = `${this.scene.title} · B: ${this.scene.other.title}`;
         this.solid?.place();
         for (const p of this.panels) p.offer(this.scene.other ? [...LAYERS, ...OTHER_LAYERS] : LAYERS);
         this.settleLayers();
@@ -188,7 +189,9 @@ class App {
   derive() {
     const r = this.scene.report, other = this.scene.other;
     this.north = r?.north_deg ?? 0;
-    this.evidence = r?.heights?.length || r?.rejected?.length ? { heights: r.heights ?? [], median: r.height_median_m, rejected: r.rejected ?? [] } : undefined;
+// Heights are the target's; a view that was rejected is so for every contact.
+    const heights = !this.contact || this.contact.volume === "main" ? r?.heights ?? [] : [];
+    this.evidence = heights.length || r?.rejected?.length ? { heights, median: r.height_median_m, rejected: r.rejected ?? [] } : undefined;
     this.offset = other?.offset_m ?? [0, 0];
   }
 
@@ -620,8 +623,8 @@ class App {
   dimensions() {
     const c = this.contact, target = !c || c.volume === "main";
     const d = target ? this.scene.dimensions ?? c?.dimensions : c.dimensions;
-    const t = target ? this.scene.truth : null, m = target ? this.surfaceMeasures : null;
-    const o = this.scene.other ? this.scene.other.dimensions : null, table = $("dimensions");
+    // Beside a second run there is room for nothing else.
+    const o = (target && this.scene.other?.dimensions) || null, t = target && !o ? this.scene.truth : null, m = target && !o ? this.surfaceMeasures : null, table = $("dimensions");
     table.replaceChildren();
     const row = (cells, head) => {
       const tr = table.insertRow();

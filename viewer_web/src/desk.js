@@ -50,6 +50,7 @@ export class Desk {
   choose(id, go = true) {
     this.app.state.contact = id;
     this.app.casts.clear();
+    this.app.derive();
     this.show();
     this.app.dimensions();
     if (go) {
@@ -113,6 +114,8 @@ export class Desk {
       lines.push(`Heights by view: median ${report.height_median_m.toFixed(2)} m, nine of ten from ${h[Math.floor(0.05 * h.length)].toFixed(2)} to ${h[Math.ceil(0.95 * h.length) - 1].toFixed(2)} m (bars round the picture).`);
     }
     if (c?.volume === "main" && report?.hollows?.voxels) lines.push(`Hollows that no shadow shows, but echoes do: ${report.hollows.volume_m3.toFixed(3)} m³.`);
+    const other = this.app.scene.other;
+    if (other) lines.push(`Run B (${other.title}) is moved by ${other.moved_m.toFixed(2)} m, so that its contact lies where the first run's does.${other.damage ? ` Its damage: ${other.damage}` : ""}`);
     for (const problem of report?.problems ?? []) lines.push(`Damage: ${problem}.`);
     const text = lines.join("\n");
     if ($("facts").dataset.text === text) return;
