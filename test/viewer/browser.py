@@ -41,7 +41,7 @@ class Watched:
     def js(self, text: str) -> Any:
         return self.page.evaluate(text)
 
-    def until(self, text: str, timeout_s: float = 20.0) -> Any:
+    def until(self, text: str, timeout_s: float = 60.0) -> Any:
         """Wait until an expression is true (by the debugger: the page itself forbids eval)."""
         end = time.monotonic() + timeout_s
         while not (value := self.js(text)):

@@ -1,0 +1,349 @@
+# What is asked of the page is JavaScript, and stays in one piece.
+# ruff: noqa: E501
+"""The operator's work: contacts, judging, rulers, picking, comparing; and every screen, by `make long`."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from browser import Watched
+
+from csas_shadow_ros.viewer.compare import Second
+from csas_shadow_ros.viewer.export import export_html
+from csas_shadow_ros.viewer.source import PathSource
+from csas_shadow_ros.viewer.store import ViewStore
+
+WEB = Path(__file__).resolve().parents[2] / "viewer_web"
+STATIC = WEB.parent / "csas_shadow_ros" / "viewer" / "static"
+SCREENS = ((1366, 768), (1920, 1080), (3840, 2160), (1024, 768), (390, 844))
+
+
+def read(folder: Path) -> ViewStore:
+    store = ViewStore()
+    source = PathSource(store, folder)
+    source.start()
+    assert source.done.wait(120)
+    return store
+
+
+@pytest.fixture
+def several(results: Path, tmp_path: Path) -> Path:
+    """The finished run, told to hold two contacts more, and a body that was left out."""
+    folder = tmp_path / "several"
+    shutil.copytree(results, folder)
+    report = json.loads((folder / "report.json").read_text())
+    grid = dict(np.load(folder / "grid.npz"))
+    for number, move in ((2, (0.7, 0.5, 0.0)), (3, (-0.6, -0.7, 0.0))):
+        np.savez_compressed(folder / f"object_{number}.npz", **grid | {"origin_m": grid["origin_m"] + move})
+        first = report["objects"][0]
+        place = [first["position_m"][i] + move[i] for i in range(2)]
+        report["objects"].append(
+            first
+            | {
+                "number": number,
+                "position_m": place,
+                "files": [f"object_{number}.npz", f"object_{number}.stl"],
+            }
+        )
+    report["objects_left_out"] = [{"position_m": [0.2, 0.9], "reason": "a phantom", "strong": True}]
+    report["views"] |= {"rejected": 1, "rejected_by_aspect_deg": {"45": "too dark"}}
+    (folder / "report.json").write_text(json.dumps(report))
+    return folder
+
+
+def test_a_contact_that_is_chosen_is_gone_to_judged_and_kept(watched, serve, several, tmp_path):
+    store = read(several)
+    url = serve(store)
+    watched.open(url)
+    page = watched.page
+    watched.until("csas.solid.further.object_3?.[0].geometry.index?.count > 0")
+    names = page.locator("#contacts button b").all_inner_texts()
+    assert names == ["Contact 1", "Contact 2", "Contact 3", "Left out 1"]
+    page.click("[data-contact=object-3]")
+    place = watched.js("csas.contact.position_m")
+    assert watched.js("csas.state.centre") == pytest.approx(place)
+    assert watched.js("csas.solid.controls.target.toArray().slice(0, 2)") == pytest.approx(place)
+    assert re.search(r"Length\s+[\d.]+ ± [\d.]+ m", page.locator("#dimensions").inner_text())
+    assert "1 rejected" in page.locator("#facts").inner_text()
+    page.click("[data-contact=left-out-1]")
+    assert "May be an object: a phantom" in page.locator("#facts").inner_text()
+    page.click("[data-contact=object-3]")
+    page.fill("[name=remark]", "fins at one end")
+    page.fill("[name=operator]", "A. Smith")
+    page.check("[value=mine-like]")
+    watched.until("csas.scene.desk.items['object-3']?.value.verdict === 'mine-like'")
+    page.click("#bookmark")
+    watched.until("document.querySelectorAll('#bookmarks li').length === 1")
+    # Another page judges the same: both are there, on both pages.
+    other = Watched(page.context.new_page())
+    other.open(url)
+    other.page.click("[data-contact=object-3]")
+    assert other.page.input_value("[name=remark]") == "fins at one end"
+    other.js("csas.desk.seen = { 'object-3': 0 }")  # as if it had begun before the first one was kept
+    other.js(
+        "csas.desk.drafts.set('object-3', { verdict: 'undecided', remark: 'rock?', operator: 'B' }), csas.desk.keepJudgement()"
+    )
+    watched.until(
+        "document.querySelector('#earlier').textContent.includes('mine-like by A. Smith (fins at one end)')"
+    )
+    other.page.close()
+    # After a restart, and in a saved file, it is all there.
+    again = read(several)
+    item = again.scene()["desk"]["items"]["object-3"]
+    assert (item["value"]["operator"], item["earlier"][0]["value"]["operator"]) == ("B", "A. Smith")
+    saved = tmp_path / "saved.html"
+    saved.write_bytes(export_html(again, 24))
+    watched.open(saved.as_uri())
+    watched.page.click("[data-contact=object-3]")
+    assert watched.page.input_value("[name=remark]") == "rock?"
+    assert watched.page.locator("[name=remark]").is_disabled()
+
+
+def test_rulers_belong_to_their_aspect_have_ends_and_refuse_what_is_no_shadow(watched, serve, several):
+    watched.open(serve(read(several)))
+    watched.js("csas.setAspect(90)")
+    watched.settle()
+    watched.until(
+        "csas.measured({ends: [[0, 0], [0, -0.5]], stamp: csas.current.stamp}) && csas.loader.lines(csas.contourAddress('', csas.sameStamp('shadow_mask', csas.current)))"
+    )
+    told = "csas.measured({ends: %s, stamp: csas.current.stamp})"
+    along = watched.js(told % "[[0, -0.35], [0, -0.8]]")
+    assert along["height"] == pytest.approx(along["L"] * np.tan(np.radians(along["psi"])))
+    across, back = (
+        watched.js(told % ends) for ends in ("[[0, -0.4], [0.5, -0.4]]", "[[0, -0.8], [0, -0.35]]")
+    )
+    beside = watched.js(told % "[[1, -0.4], [1, -0.9]]")
+    for refused, why in ((across, "off the ray"), (back, "180° off the ray"), (beside, "segmented shadow")):
+        assert "height" not in refused
+        assert why in refused["why"]
+    # Two rulers, one taken by its end; another aspect has none of them.
+    watched.js("csas.newRuler([0, -0.35], [0, -0.7]), csas.newRuler([0.1, -0.35], [0.1, -0.6]), csas.dirty()")
+    watched.drawn()
+    x, y = watched.js(
+        "(() => { const s = csas.panels[1].slider.picture, b = s.getBoundingClientRect(), k = s.width / csas.panels[1].slider.side, [x, y] = csas.panels[1].onCanvas([0, -0.7]); return [b.left + x / k, b.top + y / k]; })()"
+    )
+    page = watched.page
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x, y + 30, steps=3)
+    page.mouse.up()
+    assert watched.js("csas.rulers[0].ends[1][1]") < -0.72
+    assert watched.js("csas.rulers[1].ends[1]") == [0.1, -0.6]
+    page.locator("#rulers button", has_text="keep").first.click()
+    watched.until("csas.allRulers().filter(r => r.kept).length === 1 && csas.allRulers().length === 2")
+    watched.js("csas.setAspect(200)")
+    watched.drawn()
+    assert watched.js("csas.rulersHere().length") == 0
+    page.locator("#rulers button").first.click()
+    watched.until("csas.current.aspect_deg === 90")
+
+
+def test_a_point_of_the_shape_is_its_shadow_in_the_picture_and_a_point_of_the_picture_its_line(
+    watched, serve, run_store
+):
+    watched.open(serve(run_store))
+    watched.until("csas.solid.sides.main.triangles > 0")
+    watched.js("csas.setAspect(135), csas.desk.goTo3d(), csas.solid.render()")
+    watched.settle()
+    box = watched.page.locator("#gl").bounding_box()
+    at = watched.js(
+        "(() => { const V = csas.solid.camera.position.constructor, c = csas.place.centre, p = new V(c[0], c[1], 0.15).project(csas.solid.camera); return [(p.x + 1) / 2, (1 - p.y) / 2]; })()"
+    )
+    watched.page.mouse.click(box["x"] + at[0] * box["width"], box["y"] + at[1] * box["height"])
+    point = np.array(watched.js("csas.pick.point"))
+    stamp = int(watched.js("csas.current.stamp"))
+    sonar = np.array(watched.js("csas.current.sonar"))
+    shadow = sonar + (point - sonar) * sonar[2] / (sonar[2] - point[2])
+    assert watched.js("csas.pickedGround(csas.current)") == pytest.approx(shadow[:2], abs=0.02)
+    assert run_store.entry("shadow", stamp) is not None
+    line = np.array(
+        watched.js("Array.from(csas.solid.sides.main.picked.geometry.attributes.position.array)")
+    ).reshape(-1, 3)
+    assert line[0] == pytest.approx(sonar, rel=1e-5)
+    assert line[-1][:2] == pytest.approx(shadow[:2], abs=0.02)
+    watched.js("csas.pickGround([0.3, -0.4])")
+    line = np.array(
+        watched.js("Array.from(csas.solid.sides.main.picked.geometry.attributes.position.array)")
+    ).reshape(-1, 3)
+    assert line[-1] == pytest.approx([0.3, -0.4, 0.0], abs=1e-6)
+
+
+def test_two_runs_are_compared(watched, serve, results, several):
+    report = json.loads((several / "report.json").read_text())
+    d = report["dimensions"]
+    d["length_m"] += 1.0
+    d["position_m"] = [d["position_m"][0] + 0.5, d["position_m"][1]]
+    (several / "report.json").write_text(json.dumps(report))
+    store = read(results)
+    second = Second(store, several)
+    second.start()
+    assert second.done.wait(60)
+    watched.open(serve(store))
+    watched.until("csas.solid.further.b?.[0].geometry.index?.count > 0")
+    assert watched.js("csas.panels.map(p => p.layer)") == ["shadow", "b.shadow"]
+    watched.js("csas.setAspect(45)")
+    watched.settle()
+    assert watched.js("csas.panels.map(p => p.found.view.aspect_deg)") == [45, 45]
+    assert watched.js("csas.solid.further.b[0].position.x") == pytest.approx(-0.5)
+    rows = dict(
+        line.split("\t", 1)
+        for line in watched.page.locator("#dimensions").inner_text().splitlines()
+        if "\t" in line
+    )
+    assert "+1.00 m" in rows["Length"]
+    assert watched.js("[...document.querySelectorAll('#dimensions .differs')].map(e => e.textContent)") == [
+        "+1.00 m"
+    ]
+    assert "moved by 0.50 m" in watched.page.locator("#facts").inner_text()
+
+
+def test_six_views_evidence_section_overlay_and_the_way_back_to_the_automatic_threshold(
+    watched, serve, run_store
+):
+    watched.open(serve(run_store))
+    watched.until("csas.solid.sides.main.triangles > 0 && csas.solid.sides.other.triangles > 0")
+    page = watched.page
+    page.keyboard.press("8")
+    watched.until(
+        "csas.panels[1].sixWanted?.length === 6 && csas.panels[1].sixWanted.every(a => csas.loader.bitmap(a))"
+    )
+    watched.drawn()
+    cells = watched.js(
+        "(() => { const c = csas.panels[1].slider.picture, g = c.getContext('2d'), w = c.width / 3; return [0, 1, 2].flatMap(x => [0.31, 0.69].map(y => new Set(g.getImageData(w * x + w / 3, c.height * y, w / 3, 9).data).size)); })()"
+    )
+    assert all(n > 8 for n in cells), cells
+    page.keyboard.press("2")
+    assert watched.js("csas.evidence.heights.length") > 50
+    watched.js("csas.setAspect(csas.evidence.heights[5][0])")
+    watched.drawn()
+    assert re.match(r"height [\d.]+ m, \d+ % unexplained", page.locator("#measured").inner_text())
+    page.check("#overlay")
+    page.select_option("#section", "z")
+    watched.js("csas.solid.render()")
+    assert (
+        watched.js(
+            "csas.solid.sides.main.over.visible && csas.solid.sides.main.mesh.material.clippingPlanes.length"
+        )
+        == 1
+    )
+    before = watched.js("+document.querySelector('#threshold-main').value")
+    page.keyboard.press("t")
+    page.keyboard.press("Home")
+    assert page.locator("#row-main output").inner_text() == "hard carving"
+    page.click("#auto-main")
+    assert watched.js("+document.querySelector('#threshold-main').value") == before
+    assert "main" not in watched.js("Object.keys(csas.state.thresholds)")
+    assert page.locator("#why-here").is_visible()
+    texts = page.locator("#legend li").all_inner_texts()
+    assert {"segmented shadow", "shadow of the mesh", "rejected", "truth", "track"} <= set(texts)
+    assert page.locator("#panel-b .low").inner_text() == "-20 dB"
+
+
+def test_the_newest_view_is_followed_until_the_circle_is_turned(watched, serve):
+    from synthetic import entry
+
+    store = ViewStore(title="live", live=True)
+    store.put_view("shadow", entry(0))
+    watched.open(serve(store))
+    watched.page.check("#follow")
+    for i in range(1, 20):
+        store.put_view("shadow", entry(i))
+    watched.until("csas.state.aspect === 76")
+    watched.page.keyboard.press("ArrowLeft")
+    store.put_view("shadow", entry(40))
+    watched.until("csas.views('shadow').length === 21")
+    watched.drawn()
+    assert watched.js("csas.state.aspect") == 72
+    assert not watched.page.is_checked("#follow")
+
+
+def test_the_page_is_built_of_its_sources(tmp_path):
+    esbuild = WEB / "node_modules" / ".bin" / "esbuild"
+    if not esbuild.exists():
+        pytest.skip("no esbuild: cd viewer_web && npm ci")
+    command = json.loads((WEB / "package.json").read_text())["scripts"]["build"]
+    command = command.replace("esbuild", str(esbuild)).replace(
+        "../csas_shadow_ros/viewer/static", str(tmp_path)
+    )
+    subprocess.run(command, shell=True, cwd=WEB, check=True, capture_output=True)
+    for name in ("app.js", "worker.js"):
+        assert (tmp_path / name).read_bytes() == (STATIC / name).read_bytes(), f"{name}: npm run build"
+
+
+# Every screen
+
+
+@pytest.fixture(scope="session")
+def three(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A real run with three objects: a minute."""
+    from csas_shadow_ros.cli import main
+
+    place = tmp_path_factory.mktemp("three")
+    bodies = []
+    for x, y, size, turn in (
+        (0, 0, (0.8, 0.4, 0.4), 0.35),
+        (1.2, 0.8, (0.5, 0.4, 0.4), -0.5),
+        (-1.1, -0.9, (0.5, 0.35, 0.4), 1.2),
+    ):
+        body = trimesh.creation.box(size)
+        body.apply_transform(trimesh.transformations.rotation_matrix(turn, (0, 0, 1)))
+        body.apply_translation((x, y, size[2] / 2))
+        bodies.append(body)
+    trimesh.util.concatenate(bodies).export(place / "three.stl")
+    bag = str(place / "bag")
+    assert main(["simulate", bag, "--target", str(place / "three.stl"), "-q"]) == 0
+    given = ["--out", str(place / "run"), "--step-deg", "5", "--voxel-size-m", "0.03", "--no-figures", "-q"]
+    assert main(["run", bag, *given]) == 0
+    return place / "run"
+
+
+@pytest.fixture(scope="session")
+def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """axe-core, from npm: a tool of the tests alone, under a licence of its own (MPL)."""
+    npm = shutil.which("npm")
+    if npm is None:
+        pytest.skip("no npm to get axe-core with")
+    place = tmp_path_factory.mktemp("axe")
+    got = subprocess.run(
+        [npm, "install", "--prefix", str(place), "axe-core@4.10.3"], capture_output=True, text=True
+    )
+    if got.returncode:
+        pytest.skip(f"npm cannot get axe-core: {got.stderr.strip().splitlines()[-1][:200]}")
+    return (place / "node_modules" / "axe-core" / "axe.min.js").read_text(encoding="utf-8")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("width", "height"), SCREENS)
+def test_on_every_screen_all_is_there_and_axe_finds_nothing(watched, serve, three, axe, width, height):
+    store = read(three)
+    assert sum(c["kind"] == "object" for c in store.scene()["contacts"]) >= 3
+    watched.page.set_viewport_size({"width": width, "height": height})
+    watched.open(serve(store))
+    watched.settle()
+    for contact in ("object-2", "object-3", "object-1"):
+        watched.page.click(f"[data-contact={contact}]")
+        place = watched.js("csas.contact.position_m")
+        assert watched.js("csas.state.centre") == pytest.approx(place)
+    watched.js("csas.newRuler([0, -0.3], [0, -0.8]), csas.desk.bookmark()")
+    watched.until("document.querySelectorAll('#bookmarks li').length === 1")
+    assert watched.js("document.documentElement.scrollWidth <= innerWidth")
+    if width > 1100:
+        assert watched.js("document.documentElement.scrollHeight <= innerHeight")
+        side = watched.js("csas.panels[1].slider.side")
+        assert side > 0.34 * width or side > 0.6 * height, "the pictures use the room that there is"
+    out = watched.js(
+        "[...document.querySelectorAll('button, select, input, textarea, csas-slider')].filter(e => e.offsetParent && !e.closest('#finding') && (r => r.right > innerWidth + 1 || r.left < -1 || r.width < 8)(e.getBoundingClientRect())).map(e => e.id || e.tagName)"
+    )
+    assert out == []
+    watched.js(axe)  # by the debugger: the page itself takes no script but its own
+    found = watched.js(
+        "axe.run().then(r => r.violations.map(v => `${v.id}: ${v.nodes.map(n => n.target).join(' ')}`))"
+    )
+    assert found == []
