@@ -630,7 +630,9 @@ class App {
       const tr = table.insertRow();
       cells.forEach((cell, i) => {
         const [text, mark] = Array.isArray(cell) ? cell : [cell];
-        tr.append(Object.assign(document.createElement(head && text || (!head && !i && text) ? "th" : "td"), { textContent: text, className: mark ?? "", scope: head ? "col" : "row" }));
+        const made = Object.assign(document.createElement(text && (head || !i) ? "th" : "td"), { textContent: text, className: mark ?? "" });
+        if (made.tagName === "TH") made.scope = head ? "col" : "row";
+        tr.append(made);
       });
     };
     if (!d && !m) return void row(["", c?.reason ?? (this.scene.volumes.main ? "carved; not measured yet" : this.scene.status || "nothing carved yet")]);
