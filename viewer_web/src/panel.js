@@ -53,7 +53,8 @@ export class Panel {
     this.select.value = layer;
     this.select.onchange = () => this.choose(this.select.value);
     this.slider.addEventListener("aspect", (e) => app.setAspect(e.detail.aspect, e.detail.when, true));
-    this.slider.addEventListener("resized", () => app.dirty());
+    // A canvas that changes its size is empty: drawn at once, it is never seen so.
+    this.slider.addEventListener("resized", () => { if (this.found) this.draw(); app.dirty(); });
     this.pointers();
   }
 
