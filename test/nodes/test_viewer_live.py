@@ -133,6 +133,9 @@ def test_a_page_fills_from_the_live_graph_and_outlives_the_viewer_and_the_graph(
         page.until("csas.scene.pictures.color_by_aspect && csas.scene.volumes.other", 60)
         page.until("csas.scene.dimensions", 60)
         page.until("csas.panels.every(p => p.found?.bitmap && p.found.exact)")
+        page.until("document.querySelector('#link').textContent === 'finished: 36 of 36 views'")
+        page.until("csas.scene.contacts.length && csas.scene.report.verdict === 'object'")
+    page.until("document.querySelector('#link').textContent.startsWith('the graph is silent for')")
     # The graph is gone: what is there stays to be looked at. It comes back, with the same run, and goes on.
     page.js("csas.setAspect(90)")
     page.until("csas.current.aspect_deg === 90 && csas.panels.every(p => p.found?.bitmap && !p.found.late)")

@@ -116,7 +116,7 @@ class App {
       if (at >= 0) set.views[at] = n.view; else set.views.push(n.view);
       delete this.sorted[n.set];
       if (first) this.settleLayers();
-      if (this.scene.live && this.state.follow && n.set === this.guide && !this.scrubbing() && this.scene.progress?.state !== "finished") this.newest = n.view.aspect_deg;
+      if (this.scene.live && this.state.follow && n.set === this.guide && this.scene.progress?.state !== "finished") this.newest = n.view.aspect_deg;
       this.later();
     } else if (n.type === "part") {
       this.scene[n.part] = n.value;
