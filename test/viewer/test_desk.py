@@ -238,6 +238,7 @@ def test_the_report_is_one_page_with_the_judgement_the_dimensions_and_the_damage
     assert "expected one of: object-1" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_the_circle_is_a_moving_picture_of_every_view(results: Path, tmp_path: Path) -> None:
     from PIL import Image
 

@@ -55,6 +55,7 @@ def test_a_page_that_came_while_one_set_was_there_shows_the_other_as_soon_as_it_
     watched.settle()
 
 
+@pytest.mark.long
 def test_a_picture_that_was_chosen_by_hand_stays(watched, serve):
     store = ViewStore(title="early", live=True)
     for i in range(0, COUNT, 3):
@@ -99,7 +100,9 @@ def test_an_object_that_is_drawn_is_not_said_to_be_missing(watched, serve, run_s
 # 3
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.97])
+@pytest.mark.parametrize(
+    "share", [pytest.param(0.0, marks=pytest.mark.long), pytest.param(0.5, marks=pytest.mark.long), 0.97]
+)
 def test_a_grid_that_was_cut_short_is_named_on_the_page_and_no_page_is_saved(
     results, tmp_path, capsys, share
 ):
@@ -246,6 +249,7 @@ def test_an_empty_picture_says_what_it_waits_for(watched, serve):
     watched.until(f"{empty} === ''")
 
 
+@pytest.mark.long
 def test_a_finished_run_says_what_it_does_not_hold(watched, serve):
     store = ViewStore(title="one")
     store.put_view("shadow", entry(0))
@@ -258,7 +262,14 @@ def test_a_finished_run_says_what_it_does_not_hold(watched, serve):
 # 7
 
 
-@pytest.mark.parametrize(("width", "height"), [(60, 600), (1024, 768), (320, 240)])
+@pytest.mark.parametrize(
+    ("width", "height"),
+    [
+        (60, 600),
+        pytest.param(1024, 768, marks=pytest.mark.long),
+        pytest.param(320, 240, marks=pytest.mark.long),
+    ],
+)
 def test_no_window_is_too_small_for_the_console_to_stay_clean(watched, serve, width, height):
     store = ViewStore(title="small")
     watched.page.set_viewport_size({"width": width, "height": height})
@@ -346,6 +357,7 @@ def luminance(colour: str) -> float:
     return 0.2126 * r + 0.7152 * g + 0.0722 * b
 
 
+@pytest.mark.long
 def test_borders_stand_out_text_grows_with_the_screen_and_headings_are_there(watched, serve, run_store):
     watched.open(serve(run_store))
     for name in ("#play", "#panel-a select", "textarea"):

@@ -204,6 +204,7 @@ def test_two_runs_are_compared(watched, serve, results, several):
     assert "moved by 0.50 m" in watched.page.locator("#facts").inner_text()
 
 
+@pytest.mark.long
 def test_six_views_evidence_section_overlay_and_the_way_back_to_the_automatic_threshold(
     watched, serve, run_store
 ):
@@ -246,6 +247,7 @@ def test_six_views_evidence_section_overlay_and_the_way_back_to_the_automatic_th
     assert page.locator("#panel-b .low").inner_text() == "-20 dB"
 
 
+@pytest.mark.long
 def test_the_newest_view_is_followed_until_the_circle_is_turned(watched, serve):
     from synthetic import entry
 
