@@ -11,15 +11,6 @@ def _mapping(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def _latitude_longitude(value: Any) -> tuple[float, float] | None:
-    found = _mapping(value)
-    for latitude, longitude in (("latitude_deg", "longitude_deg"), ("latitude", "longitude")):
-        pair = found.get(latitude), found.get(longitude)
-        if all(isinstance(v, int | float) and math.isfinite(v) for v in pair):
-            return float(pair[0]), float(pair[1])  # type: ignore[arg-type]
-    return None
-
-
 def geographic(entry: Mapping[str, Any]) -> tuple[float, float] | None:
     """Return latitude and longitude (deg, WGS-84) of an object, if its entry of the report tells them.
 
@@ -30,13 +21,15 @@ def geographic(entry: Mapping[str, Any]) -> tuple[float, float] | None:
     >>> geographic({"position_m": [0.0, 0.0]}) is None
     True
     """
-    told = (_latitude_longitude(one) for one in (entry, *entry.values()))
-    return next((one for one in told if one is not None), None)
+    place = _mapping(entry.get("place"))
+    if not place:
+        return None
+    return float(place["latitude_deg"]), float(place["longitude_deg"])
 
 
 def north_deg(report: Mapping[str, Any]) -> float:
     """Return where true north is, degrees counter-clockwise from the scene's +y: 0 unless the run says so."""
-    heading = _mapping(report.get("origin")).get("heading_deg")
+    heading = _mapping(report.get("datum")).get("heading_deg")
     return float(heading) if isinstance(heading, int | float) and math.isfinite(heading) else 0.0
 
 
