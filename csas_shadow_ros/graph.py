@@ -58,10 +58,9 @@ _GRACE_S, _PATIENCE_S = 5.0, 120.0
 _SHARED_MEMORY = 1 << 30
 #: The middleware's segments, and the name of the file that their owner holds locked.
 _SEGMENTS, _OWNER = "/dev/shm/fastrtps_", "_el"
-#: How often it is looked which a process has, once it has some: it makes them as it starts.
-_LOOK_S = 1.0
-#: Who makes a segment holds its lock within milliseconds: one so old that nobody holds is nobody's.
-_LOCKED_S = 1.0
+#: Who makes a segment holds its lock within milliseconds: one so old that nobody holds is nobody's. Of other
+#: graphs' processes, which may be stopped just then, it is taken for certain only much later.
+_LOCKED_S, _LONG_LOCKED_S = 1.0, 60.0
 #: Views are a few MB: by default glibc gives such memory back at once, and a quarter of the nodes' time went
 #: into getting it again, page by page.
 _MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(1 << 26), "MALLOC_TRIM_THRESHOLD_": str(1 << 28)}
@@ -211,8 +210,11 @@ def remove_segment(segment: Path) -> None:
         owner.unlink(missing_ok=True)
 
 
-def remove_strays(since_s: float, until_s: float) -> None:
-    """Remove this user's segments that were made in a span of time (s since 1970) and whose owner died."""
+def remove_strays(since_s: float = 0.0, until_s: float = math.inf) -> None:
+    """Remove this user's segments that were made in a span of time (s since 1970) and whose owner died.
+
+    A second old they must be: whoever makes one may not hold its lock yet.
+    """
     folder = Path(_SEGMENTS).parent
     for owner in folder.glob(f"{Path(_SEGMENTS).name}*{_OWNER}"):
         with contextlib.suppress(OSError):
@@ -235,6 +237,21 @@ def remove_ports(domain_id: int) -> None:
                 port.with_name(f"sem.{port.name}_mutex").unlink(missing_ok=True)
 
 
+def tidy_up_after_a_killed_graph(domain_id: int, since_s: float) -> None:
+    """Remove the shared memory of a graph whose launching process was killed.
+
+    Parameters
+    ----------
+    domain_id : int
+        Its ROS domain.
+    since_s : float
+        When it began. Every node does this after its own end: the last one finds all the others'.
+    """
+    remove_strays(since_s)
+    if _unused(domain_id):
+        remove_ports(domain_id)
+
+
 def graph_environment(domain_id: int, log_dir: Path, graph_id: str = "") -> dict[str, str]:
     """Return the environment of the graph's processes: this machine alone, shared memory, few threads."""
     own = {
@@ -243,6 +260,7 @@ def graph_environment(domain_id: int, log_dir: Path, graph_id: str = "") -> dict
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_LOG_DIR": str(log_dir),
         "CSAS_PARENT_PID": str(os.getpid()),
+        "CSAS_SINCE_S": repr(time.time()),
     }
     if free_shared_memory() >= _SHARED_MEMORY:
         profile = str(config_file("fastdds_shm.xml"))
@@ -565,9 +583,6 @@ class GraphProcess:
         self._asked_s = 0.0
         self._process: subprocess.Popen[bytes] | _Forked | None = None
         self._log_file: IO[bytes] | None = None
-        self._segments: set[Path] = set()
-        self._looked_s = -math.inf
-        self._began_s = 0.0
 
     @property
     def pid(self) -> int:
@@ -587,8 +602,6 @@ class GraphProcess:
         """Start the process, or start it again."""
         self.restarts += 1
         self._process = None
-        self.clean_up()
-        self._began_s = time.time()
         if self._server is None:
             self._start_alone()
         else:
@@ -600,19 +613,6 @@ class GraphProcess:
         if again is None:
             return self._arguments
         return [*(self._arguments or ["--ros-args"]), "-p", again]
-
-    def look(self) -> None:
-        """Note, now and then, which shared memory the process owns."""
-        if self._process is not None and (not self._segments or time.monotonic() - self._looked_s > _LOOK_S):
-            self._looked_s = time.monotonic()
-            self._segments |= segments_of(self._process.pid)
-
-    def clean_up(self) -> None:
-        """Remove the shared memory of a process that was killed: nobody else would, before the next boot."""
-        for segment in self._segments:
-            remove_segment(segment)
-        self._segments.clear()
-        self._looked_s = -math.inf
 
     def _start_alone(self) -> None:
         self.close_log()
@@ -670,9 +670,11 @@ class GraphProcess:
             self._process.kill()
             self._process.wait()
 
-    def strays(self) -> tuple[float, float] | None:
-        """Return when a process that died may have made segments that nobody saw; None if they are known."""
-        return None if self._segments else (self._began_s, time.time())
+    @property
+    def killed(self) -> bool:
+        """Whether a signal has ended the process."""
+        code = None if self._process is None else self._process.poll()
+        return code is not None and code < 0
 
     def close_log(self) -> None:
         """Close the log file."""
@@ -730,9 +732,12 @@ class Graph:
         self.max_restarts = max_restarts
         #: One line for each process that died.
         self.deaths: list[str] = []
-        self._strays: list[tuple[float, float]] = []
+        self._began_s = self._death_s = 0.0
 
     def __enter__(self) -> Graph:
+        self._began_s = time.time()
+        # What a graph left whose launching process was killed together with its nodes.
+        remove_strays(until_s=self._began_s - _LONG_LOCKED_S)
         try:
             for process in sorted(self.processes.values(), key=lambda p: _START_ORDER.index(p.node)):
                 process.start()
@@ -757,10 +762,9 @@ class Graph:
         for name, process in self.processes.items():
             code = process.poll()
             if code is None:
-                process.look()
                 continue
-            if code < 0 and (span := process.strays()) is not None:
-                self._strays.append(span)
+            if code < 0:
+                self._death_s = time.time()
             if code == 2:
                 raise ReplayError(f"{name} refused to start: {process.last_line()}")
             how = f"was killed by signal {-code}" if code < 0 else f"ended with status {code}"
@@ -768,6 +772,10 @@ class Graph:
             if process.restarts >= self.max_restarts:
                 raise ReplayError(f"{name} died {process.restarts + 1} times; {self.deaths[-1]}")
             process.start()
+        if self._death_s and time.time() > self._death_s + 1.1 * _LOCKED_S:
+            # Nobody else removes the shared memory of a process that was killed, before the next boot.
+            self._death_s = 0.0
+            remove_strays(self._began_s)
 
     def stop(self) -> None:
         """End all processes: asked first, so that a recorder finishes its bag, then killed."""
@@ -779,13 +787,13 @@ class Graph:
             for name, process in self.processes.items():
                 process.wait(30.0 if name == "bag_recorder" else 5.0)
                 process.close_log()
-                process.clean_up()
-            if self._strays:
-                # Of processes that were killed as soon as they had begun.
-                time.sleep(max(0.0, max(end for _, end in self._strays) + 1.1 * _LOCKED_S - time.time()))
-                for since_s, until_s in self._strays:
-                    remove_strays(since_s, until_s)
-                self._strays.clear()
+                if process.killed:
+                    self._death_s = time.time()
+            if self._death_s:
+                # Also of processes that were killed as soon as they had begun, or just now.
+                time.sleep(max(0.0, self._death_s + 1.1 * _LOCKED_S - time.time()))
+                remove_strays(self._began_s)
+                self._death_s = 0.0
         except BaseException:
             # Another Ctrl-C: no process is left behind for that, not even as a zombie.
             if self._server is not None:
@@ -795,5 +803,5 @@ class Graph:
             for process in self.processes.values():
                 process.wait(5.0)
                 process.close_log()
-                process.clean_up()
+            remove_strays(self._began_s)
             raise

@@ -1265,8 +1265,19 @@ def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> in
             del node
             gc.collect()
     finally:
+        domain_id = context.get_domain_id() if context.ok() else None
         rclpy.try_shutdown(context=context)
+        if _is_orphan() and domain_id is not None:
+            from csas_shadow_ros.graph import tidy_up_after_a_killed_graph
+
+            tidy_up_after_a_killed_graph(domain_id, float(os.environ["CSAS_SINCE_S"]))
     return code
+
+
+def _is_orphan() -> bool:
+    """Say whether the process that started this one, as a graph's node, is gone without having ended it."""
+    parent = os.environ.get("CSAS_PARENT_PID")
+    return bool(parent) and os.getppid() != int(parent or 0)
 
 
 def make_executor(context: Context) -> Executor:
@@ -1286,7 +1297,6 @@ def make_executor(context: Context) -> Executor:
 
 def spin(node: CsasNode, stop: threading.Event) -> None:
     """Spin until told to stop; a message that cannot even be taken is counted, not fatal."""
-    parent = os.environ.get("CSAS_PARENT_PID")
     executor = make_executor(node.context)
     executor.add_node(node)
     node.start_waiting_work()
@@ -1298,7 +1308,7 @@ def spin(node: CsasNode, stop: threading.Event) -> None:
                 return
             except Exception as error:
                 node.fault("message could not be taken", error)
-            if parent and os.getppid() != int(parent):
+            if _is_orphan():
                 return  # whoever started us is gone without ending us
     finally:
         executor.remove_node(node)

@@ -1,0 +1,272 @@
+"""A live graph of processes that circles one contact after another, under kills; `soak.py` starts it.
+
+Prints a line of JSON at its end: kills, faults, seconds a circle, and the memory of every process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import shutil
+import signal
+import statistics
+import sys
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from soak import STEP_DEG, STREAMS, VOXEL_M, Bags, hash_of
+
+from csas_shadow_ros.bags import read_run
+from csas_shadow_ros.core.geometry import Track
+from csas_shadow_ros.graph import DomainReservation, Graph, environment_of, new_graph_id, start_fork_server
+from csas_shadow_ros.nodes import qos
+from msg_adapters import (
+    Heartbeat,
+    RclpyMessages,
+    coherent_image_to_msgs,
+    measurements_from_msg,
+    progress_from_msg,
+    topic,
+    track_to_msg,
+    voxel_grid_from_msgs,
+)
+from msg_adapters.topics import TOPICS
+
+#: Seconds between the circles of two contacts: more than one takes.
+APART_NS = 1000 * 10**9
+#: A circle that has not ended by then never will.
+PATIENCE_S = 240.0
+MESSAGES = RclpyMessages()
+PLAN: dict[str, dict[str, Any]] = {
+    "sub_aperture": {"step_deg": STEP_DEG, "min_sinks": 2},
+    "shadow_enhancement": {},
+    "shadow_likelihood": {},
+    "voxel_carver": {"voxel_size_m": VOXEL_M, "publish_hz": 0.0},
+    "composites": {"publish_hz": 0.0},
+    "bag_recorder": {"compression": "lz4", "sync": False},
+}
+
+
+class Vehicle:
+    """Publishes what an outside processor would, and listens to what the graph leaves."""
+
+    def __init__(self, graph: Graph, domain: int, namespace: str) -> None:
+        self.graph = graph
+        self.context = Context()
+        own = {k: v for k, v in graph.environment.items() if k.startswith(("ROS_", "FAST"))}
+        with environment_of(own):
+            rclpy.init(context=self.context, domain_id=domain)
+            self.node = rclpy.create_node("vehicle", context=self.context, namespace=namespace)
+        self.publishers = {
+            name: self.node.create_publisher(self._kind(name), name, qos.LATCHED)
+            for name in ("image", "camera_info", "track")
+        }
+        self.latest: dict[str, Any] = {}
+        #: Hash of the grid, and views used, of each run that was published as final.
+        self.final: dict[int | None, tuple[str, int]] = {}
+        self.lost: dict[str, int] = {}
+        for name in ("voxel_grid/image", "voxel_grid/camera_info", "measurements"):
+            self.node.create_subscription(self._kind(name), name, partial(self._take, name), qos.LATCHED)
+        self.node.create_subscription(MESSAGES.cls(TOPICS["progress"].type_name), "progress", self._hear, qos.REPORTS)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    @staticmethod
+    def _kind(name: str) -> Any:
+        return MESSAGES.cls(topic(name).type_name)
+
+    def _hear(self, msg: Any) -> None:
+        item = progress_from_msg(msg)
+        if isinstance(item, Heartbeat) and item.counts.get("lost"):
+            self.lost[item.instance] = item.counts["lost"]
+
+    def _take(self, name: str, message: Any) -> None:
+        self.latest[name] = message
+        if set(self.latest) < {"voxel_grid/image", "voxel_grid/camera_info", "measurements"}:
+            return
+        stamps = {(m.header.stamp.sec, m.header.stamp.nanosec) for m in self.latest.values()}
+        told = measurements_from_msg(self.latest["measurements"])
+        if told.final and len(stamps) == 1:
+            image, info = self.latest["voxel_grid/image"], self.latest["voxel_grid/camera_info"]
+            self.final[told.run_ns] = hash_of(voxel_grid_from_msgs(image, info)[2]), told.views_used
+
+    def send(self, bag: Any, by_ns: int) -> int:
+        """Publish a bag's run as one that was sailed later; return its name."""
+        track = Track(bag.require_track().stamps_ns + by_ns, bag.require_track().positions_m)
+        image = bag.coherent_image()
+        self.publishers["track"].publish(track_to_msg(MESSAGES, track))
+        picture, info = coherent_image_to_msgs(MESSAGES, replace(image, stamp_ns=image.stamp_ns + by_ns))
+        self.publishers["camera_info"].publish(info)
+        self.publishers["image"].publish(picture)
+        return int(track.stamps_ns[0])
+
+    def close(self) -> None:
+        """Go."""
+        self.executor.shutdown(timeout_sec=1.0)
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+def memory_kb(pid: int) -> int:
+    """Return what a process holds in memory of its own: what it shares with its fork server is not counted."""
+    with contextlib.suppress(OSError):
+        for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
+            if line.startswith("Pss_Anon:"):
+                return int(line.split()[1])
+    return 0
+
+
+def drift(values: list[int]) -> dict[str, float]:
+    """Say how memory changed between the second quarter of a soak and its last one."""
+    quarter = len(values) // 4
+    if not quarter:
+        return {"first_mb": round(values[0] / 1024, 1), "last_mb": round(values[-1] / 1024, 1)}
+    early, late = statistics.median(values[quarter : 2 * quarter]), statistics.median(values[-quarter:])
+    return {
+        "second_quarter_mb": round(early / 1024, 1),
+        "last_quarter_mb": round(late / 1024, 1),
+        "change_percent": round(100.0 * (late - early) / max(early, 1), 1),
+    }
+
+
+def go(given: argparse.Namespace) -> dict[str, Any]:
+    """Circle after circle."""
+    rng = random.Random(given.seed)
+    bags = Bags(given.bags)
+    runs = [(scene, read_run(bags.path(scene))) for scene in Bags.SCENES[:3]]
+    line: dict[str, Any] = {"kills": [], "faults": [], "circle_s": [], "grids": 0}
+    memory: dict[str, list[int]] = {}
+    kills_left = given.kills if given.kills >= 0 else rng.randint(2, 6)
+    began = time.monotonic()
+    recording = given.folder / "recording"
+    with contextlib.ExitStack() as stack:
+        domain = given.domain if given.domain >= 0 else stack.enter_context(DomainReservation())
+        logs = given.folder / "log"
+        graph_id = new_graph_id()
+        server = stack.enter_context(start_fork_server(domain, logs, graph_id))
+        plan = {**PLAN, "bag_recorder": {**PLAN["bag_recorder"], "out": str(recording)}}
+        graph = Graph(plan, domain, logs, 1000, server, graph_id)
+        for process in graph.processes.values():
+            process._arguments = [*(process._arguments or ["--ros-args"]), "-r", f"__ns:={given.namespace}"]
+        stack.enter_context(graph)
+        vehicle = Vehicle(graph, domain, given.namespace)
+        stack.callback(vehicle.close)
+        circle = 0
+        while circle < given.circles or time.monotonic() - began < given.seconds:
+            scene, bag = runs[(circle + given.first) % len(runs)]
+            name, expected = vehicle.send(bag, circle * APART_NS), bags.live_hash(scene)
+            since = time.monotonic()
+            due = sorted(
+                (since + rng.uniform(0.0, 6.0 if circle else 9.0), rng.choice([*graph.processes, "fork_server"]))
+                for _ in range((kills_left + 1) // 2 if circle + 1 < given.circles else kills_left)
+            )
+            while name not in vehicle.final:
+                graph.watch()
+                vehicle.executor.spin_once(timeout_sec=0.05)
+                while due and time.monotonic() > due[0][0]:
+                    victim = due.pop(0)[1]
+                    kills_left -= 1
+                    if victim == "fork_server" and server is None:
+                        continue
+                    pid = server.pid if victim == "fork_server" and server else graph.processes[victim].pid
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGKILL)
+                        line["kills"].append((round(time.monotonic() - began, 2), victim))
+                if time.monotonic() - since > PATIENCE_S:
+                    line["faults"].append(f"hung: circle {circle} is not at its end after {PATIENCE_S:g} s")
+                    return line
+            found, views = vehicle.final[name]
+            if (found, views) != (expected, 36):
+                line["faults"].append(f"the grid differs: circle {circle} of {scene}: {found}, {views} views")
+            line["grids"] += found == expected
+            line["circle_s"].append(round(time.monotonic() - since, 1))
+            if given.seconds:
+                for node, process in graph.processes.items():
+                    memory.setdefault(node, []).append(memory_kb(process.pid))
+                if server is not None:
+                    memory.setdefault("fork_server", []).append(memory_kb(server.pid))
+                with (given.folder / "memory.jsonl").open("a") as file:
+                    file.write(json.dumps({k: v[-1] for k, v in memory.items()}) + "\n")
+                for old in sorted(given.folder.glob("recording*"), key=os.path.getmtime)[:-2]:
+                    shutil.rmtree(old)  # a soak would fill the disk
+            circle += 1
+            rest = time.monotonic() + given.rest
+            while time.monotonic() < rest:
+                graph.watch()
+                vehicle.executor.spin_once(timeout_sec=0.05)
+        # What the recorder lacks yet is sent again before the source says that it has finished.
+        end = time.monotonic() + 60.0
+        names = ["recording", *(f"recording_{n}" for n in range(2, circle + 1))]
+        while not given.seconds and time.monotonic() < end and not recorded(given.folder / names[-1], graph, vehicle):
+            graph.watch()
+        if vehicle.lost:
+            line["faults"].append(f"views lost: {vehicle.lost}")
+        line["lost"] = sum(vehicle.lost.values())
+        vehicle.executor.spin_once(timeout_sec=0.1)
+        graph.stop()
+        if not given.seconds:
+            for folder in names:
+                counts = read_run(given.folder / folder).counts
+                if short := {s: counts.get(s, 0) for s in STREAMS if counts.get(s, 0) != 36}:
+                    line["faults"].append(f"{folder} lacks views: {short}")
+    line |= {"circles": circle, "wall_s": round(time.monotonic() - began, 1)}
+    if memory:
+        line["memory"] = {node: drift(values) for node, values in memory.items()}
+        line["circle_s"] = line["circle_s"][:: max(len(line["circle_s"]) // 20, 1)]
+        for node, told in line["memory"].items():
+            if abs(told.get("change_percent", 0.0)) > 5.0:
+                line["faults"].append(f"memory of {node} is not flat: {told}")
+    return line
+
+
+def recorded(_: Path, graph: Graph, vehicle: Vehicle) -> bool:
+    """Spin a while; say whether the source has said to the running recorder that it has every view."""
+    done: set[str] = set()
+    beats: dict[tuple[str, str], Heartbeat] = {}
+
+    def hear(msg: Any) -> None:
+        item = progress_from_msg(msg)
+        if isinstance(item, Heartbeat):
+            done.update(item.values.get("finished_for", "").split())
+            beats[item.node, item.values.get("input", "")] = item
+
+    kind = MESSAGES.cls(TOPICS["progress"].type_name)
+    subscription = vehicle.node.create_subscription(kind, "progress", hear, qos.REPORTS)
+    end = time.monotonic() + 1.5
+    while time.monotonic() < end:
+        vehicle.executor.spin_once(timeout_sec=0.05)
+    vehicle.node.destroy_subscription(subscription)
+    mine = [b for (node, stream), b in beats.items() if node == "bag_recorder" and stream in STREAMS]
+    return len(mine) == len(STREAMS) and all(b.instance in done for b in mine) and "bag_recorder" in graph.processes
+
+
+def main() -> int:
+    """Print the line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("bags", type=Path)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--circles", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=0.0)
+    parser.add_argument("--kills", type=int, default=-1, help="-1: two to six")
+    parser.add_argument("--rest", type=float, default=0.0, help="seconds between circles")
+    parser.add_argument("--first", type=int, default=0, help="contact to begin with")
+    parser.add_argument("--domain", type=int, default=-1)
+    parser.add_argument("--namespace", default="/csas")
+    print(json.dumps(go(parser.parse_args())), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
