@@ -48,14 +48,17 @@ def object_threshold(likelihood: NDArray[np.float32], method: str) -> float:
     Returns
     -------
     float
-        Threshold; NaN where no voxel is much darker than the rest: there is no object.
+        Threshold; NaN where no voxel is much darker than the rest, and the rest is free: there is no object.
     """
     known = likelihood[np.isfinite(likelihood)]
     if known.size < 2 * _DARKEST:
         return math.nan
     dark = float(np.partition(known, _DARKEST)[:_DARKEST].mean())
     bright = float(np.percentile(known, 99.0))
-    if bright <= 0.0 or dark > _NO_OBJECT * bright:
+    inside = {"consensus": _CONSENSUS, "hard": _HARD}.get(method, _SOFT_SUPPORT)
+    if bright < inside:
+        return inside  # nothing of the volume is seen to be free: it lies within the object
+    if dark > _NO_OBJECT * bright:
         return math.nan
     if method == "soft":
         return dark + _SOFT_LEVEL * (bright - dark)

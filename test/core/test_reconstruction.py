@@ -142,6 +142,22 @@ def test_a_volume_that_cuts_the_object_is_told(whole):
     assert any("cuts the object" in reason for reason in found.quality.reasons)
 
 
+@pytest.mark.parametrize("method", ["consensus", "hard", "soft"])
+@pytest.mark.parametrize("size_m", [(0.24, 0.18, 0.15), (0.15, 0.15, 0.15)])
+def test_a_volume_that_lies_within_the_object_is_told(whole, method, size_m):
+    result, views = whole
+    inside = Target(result.target.position_m, size_m)
+    parameters = replace(COARSE, carving=replace(COARSE.carving, method=method))
+    carved = Reconstruction(Decision(inside), parameters)
+    carved.feed(
+        [view.shadow for view in views], lambda shadow: [ProcessedView(inside, parameters, shadow=shadow)]
+    )
+    found = carved.result()
+    assert found.verdict == "object"
+    assert found.quality.verdict == "not trustworthy"
+    assert any("lies inside of the object" in reason for reason in found.quality.reasons)
+
+
 def test_without_a_usable_view_the_answer_is_undecided(whole):
     nothing = Reconstruction(Decision(whole[0].target), COARSE)
     nothing.refuse(0.0, "too dark")

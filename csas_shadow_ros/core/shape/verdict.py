@@ -31,6 +31,8 @@ _SCATTER_CELLS = 1.0
 #: that see a tip. Those alone bound the top, so that a quarter of the circle without tips changes no height
 #: (the benchmark's frame, 28 %); with none the top is unknown.
 _MOST_CUT = 0.5
+#: So many sides `cut_sides` looks at: the bottom is the seabed.
+_ALL_SIDES = 5
 
 
 def judge(result: Result) -> None:
@@ -67,9 +69,12 @@ def judge(result: Result) -> None:
         if result.verdict == "no object":
             result.verdict, worst = "undecided", 2
     if result.mesh is not None and result.grid is not None:
-        for side in cut_sides(result.grid):
-            reasons.append(f"the carved volume cuts the object at its {side}")
-            worst = 2
+        sides = cut_sides(result.grid)
+        if len(sides) == _ALL_SIDES:
+            reasons.append("the carved volume lies inside of the object: it ends at no side of it")
+        else:
+            reasons += [f"the carved volume cuts the object at its {side}" for side in sides]
+        worst = 2 if sides else worst
     if result.views_used:
         arc = math.degrees(result.arc_rad)
         if arc < 360.0 * _WHOLE_ARC:
