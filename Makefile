@@ -17,6 +17,8 @@ PYTEST_WORKERS ?= 2
 ACCURACY_ARGUMENTS ?=
 # Of the population: make population POPULATION_ARGUMENTS='--half test --scenes 500 --out FOLDER'
 POPULATION_ARGUMENTS ?= --half development --scenes 60 --workers 2 --out build/population
+# Of the harness of kills, which goes on where it was: make soak SOAK_ARGUMENTS='--seed 200 --trials 200'
+SOAK_ARGUMENTS ?= --trials 200 --circles 200 --same-draw 30 --two-graphs 30 --soak 3600
 # And of the speed benchmark: make bench BENCH_ARGUMENTS='--only chain carving'
 BENCH_ARGUMENTS ?=
 
@@ -30,7 +32,7 @@ SOURCES := $(shell find csas_shadow_ros msg_adapters config launch -type f \
 	-not -name '*.pyc' -not -path '*/__pycache__*' 2>/dev/null)
 PACKAGING := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help venv install demo test lint types unit long accuracy accuracy-short population bench build clean
+.PHONY: help venv install demo test lint types unit long soak accuracy accuracy-short population bench build clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -75,6 +77,10 @@ unit: install ## pytest alone
 long: install ## the tests that `make test` leaves out: more of the same
 	@mkdir -p $(ROS_LOG_DIR)
 	$(PY) -m pytest -m long
+
+soak: install ## kills, stops, full disks: hundreds of trials, and an hour in one graph
+	@mkdir -p $(ROS_LOG_DIR)
+	$(PY) test/faults/soak.py $(SOAK_ARGUMENTS)
 
 accuracy-short: install ## a few cases of it against their floors, in a minute
 	$(PY) benchmarks/accuracy.py --short

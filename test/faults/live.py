@@ -78,7 +78,8 @@ class Vehicle:
         self.lost: dict[str, int] = {}
         for name in ("voxel_grid/image", "voxel_grid/camera_info", "measurements"):
             self.node.create_subscription(self._kind(name), name, partial(self._take, name), qos.LATCHED)
-        self.node.create_subscription(MESSAGES.cls(TOPICS["progress"].type_name), "progress", self._hear, qos.REPORTS)
+        kind = MESSAGES.cls(TOPICS["progress"].type_name)
+        self.node.create_subscription(kind, "progress", self._hear, qos.REPORTS)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
 
@@ -119,7 +120,7 @@ class Vehicle:
 
 
 def memory_kb(pid: int) -> int:
-    """Return what a process holds in memory of its own: what it shares with its fork server is not counted."""
+    """Return what a process holds in memory of its own: what it shares is not counted."""
     with contextlib.suppress(OSError):
         for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
             if line.startswith("Pss_Anon:"):
@@ -148,6 +149,8 @@ def go(given: argparse.Namespace) -> dict[str, Any]:
     line: dict[str, Any] = {"kills": [], "faults": [], "circle_s": [], "grids": 0}
     memory: dict[str, list[int]] = {}
     kills_left = given.kills if given.kills >= 0 else rng.randint(2, 6)
+    # In a graph that lives long, forked nodes alone are killed: without its server each takes long to start.
+    victims = [*PLAN, *([] if given.kills_a_circle else ["fork_server"])]
     began = time.monotonic()
     recording = given.folder / "recording"
     with contextlib.ExitStack() as stack:
@@ -167,16 +170,16 @@ def go(given: argparse.Namespace) -> dict[str, Any]:
             scene, bag = runs[(circle + given.first) % len(runs)]
             name, expected = vehicle.send(bag, circle * APART_NS), bags.live_hash(scene)
             since = time.monotonic()
-            due = sorted(
-                (since + rng.uniform(0.0, 6.0 if circle else 9.0), rng.choice([*graph.processes, "fork_server"]))
-                for _ in range((kills_left + 1) // 2 if circle + 1 < given.circles else kills_left)
-            )
+            share = (kills_left + 1) // 2 if circle + 1 < given.circles else kills_left
+            count = rng.randint(1, given.kills_a_circle) if given.kills_a_circle else share
+            span_s = 6.0 if circle else 9.0
+            due = sorted((since + rng.uniform(0.0, span_s), rng.choice(victims)) for _ in range(count))
             while name not in vehicle.final:
                 graph.watch()
                 vehicle.executor.spin_once(timeout_sec=0.05)
                 while due and time.monotonic() > due[0][0]:
                     victim = due.pop(0)[1]
-                    kills_left -= 1
+                    kills_left = max(kills_left - 1, 0)
                     if victim == "fork_server" and server is None:
                         continue
                     pid = server.pid if victim == "fork_server" and server else graph.processes[victim].pid
@@ -201,6 +204,9 @@ def go(given: argparse.Namespace) -> dict[str, Any]:
                 for old in sorted(given.folder.glob("recording*"), key=os.path.getmtime)[:-2]:
                     shutil.rmtree(old)  # a soak would fill the disk
             circle += 1
+            with (given.folder / "circles.jsonl").open("a", encoding="utf-8") as file:
+                told = {k: v if isinstance(v, int) else len(v) for k, v in line.items()}
+                file.write(json.dumps(told) + "\n")
             rest = time.monotonic() + given.rest
             while time.monotonic() < rest:
                 graph.watch()
@@ -208,7 +214,7 @@ def go(given: argparse.Namespace) -> dict[str, Any]:
         # What the recorder lacks yet is sent again before the source says that it has finished.
         end = time.monotonic() + 60.0
         names = ["recording", *(f"recording_{n}" for n in range(2, circle + 1))]
-        while not given.seconds and time.monotonic() < end and not recorded(given.folder / names[-1], graph, vehicle):
+        while not given.seconds and time.monotonic() < end and not recorded(vehicle):
             graph.watch()
         if vehicle.lost:
             line["faults"].append(f"views lost: {vehicle.lost}")
@@ -230,7 +236,7 @@ def go(given: argparse.Namespace) -> dict[str, Any]:
     return line
 
 
-def recorded(_: Path, graph: Graph, vehicle: Vehicle) -> bool:
+def recorded(vehicle: Vehicle) -> bool:
     """Spin a while; say whether the source has said to the running recorder that it has every view."""
     done: set[str] = set()
     beats: dict[tuple[str, str], Heartbeat] = {}
@@ -248,7 +254,7 @@ def recorded(_: Path, graph: Graph, vehicle: Vehicle) -> bool:
         vehicle.executor.spin_once(timeout_sec=0.05)
     vehicle.node.destroy_subscription(subscription)
     mine = [b for (node, stream), b in beats.items() if node == "bag_recorder" and stream in STREAMS]
-    return len(mine) == len(STREAMS) and all(b.instance in done for b in mine) and "bag_recorder" in graph.processes
+    return len(mine) == len(STREAMS) and all(b.instance in done for b in mine)
 
 
 def main() -> int:
@@ -260,6 +266,7 @@ def main() -> int:
     parser.add_argument("--circles", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=0.0)
     parser.add_argument("--kills", type=int, default=-1, help="-1: two to six")
+    parser.add_argument("--kills-a-circle", type=int, default=0, help="one to so many, in every circle")
     parser.add_argument("--rest", type=float, default=0.0, help="seconds between circles")
     parser.add_argument("--first", type=int, default=0, help="contact to begin with")
     parser.add_argument("--domain", type=int, default=-1)

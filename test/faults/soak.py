@@ -2,9 +2,10 @@
 
 ``python test/faults/soak.py --trials 200 --out FOLDER`` appends a line of JSON a trial to
 ``FOLDER/trials.jsonl`` and says at the end what it found; started again it goes on. ``--seed N --trials 1``
-is one trial of it. Other modes: ``--soak SECONDS`` (circle after circle in one live graph, with the memory of
-every process), ``--same-draw ROUNDS`` (four replays at once that draw the same random numbers), ``--two-graphs
-CIRCLES`` (one domain, two namespaces), ``--report`` (what the lines say). ``docs/reliability.md`` has figures.
+is one trial of it. Other modes: ``--circles N`` (in one live graph, with kills in each), ``--soak SECONDS``
+(circle after circle in one live graph, with the memory of every process), ``--same-draw ROUNDS`` (four
+replays at once that draw the same random numbers), ``--two-graphs CIRCLES`` (one domain, two namespaces),
+``--report`` (what the lines say). ``docs/reliability.md`` has figures.
 
 A trial names in ``faults`` what must not be; a sound one names nothing. Every process of a trial is known by
 an environment variable that its descendants inherit, and none but those is ever signalled.
@@ -344,8 +345,7 @@ def watch(command: Command, havoc: Havoc | None, faults: list[str], limit_s: flo
     while command.process.poll() is None:
         if time.monotonic() - began > limit_s:
             faults.append(f"hung: not at its end after {limit_s:g} s")
-            logs = [f"{name_of(p) or 'launcher'} {Path(f'/proc/{p}/wchan').read_text()}" for p in marked(command.mark)]
-            faults[-1] += f" ({', '.join(logs)})"
+            faults[-1] += f"; {', '.join(name_of(p) or str(p) for p in marked(command.mark))} are there"
             break
         nodes = command.nodes()
         if havoc is not None:
@@ -460,7 +460,8 @@ class Trial:
         command = [sys.executable, "-m", "csas_shadow_ros.cli", "check", str(out)]
         done = subprocess.run(command, env=environment(), capture_output=True, text=True, check=False)
         if done.returncode:
-            self.faults.append(f"check of {out.name}: {done.stdout.strip()[-200:]} {done.stderr.strip()[-200:]}")
+            told = f"{done.stdout.strip()[-200:]} {done.stderr.strip()[-200:]}"
+            self.faults.append(f"check of {out.name}: {told}")
 
     def take(self, havoc: Havoc, wall_s: float, undisturbed_s: float) -> None:
         """Note what was done."""
@@ -537,7 +538,7 @@ class Trial:
         self.faults += [line for command, *_ in commands for line in command.left()]
 
     def one_folder(self) -> None:
-        """Two replays at once into one folder: what is in place at the end is whole, and is of one of them."""
+        """Two replays at once into one folder: what is in place at the end is whole, and one of them."""
         more = ["--overwrite"] if self.rng.random() < 0.5 else []
         hashes = {scene: self.bags.hash_of(scene) for scene in ("box", "cone")}
         commands = []
@@ -659,7 +660,11 @@ def live_child(mark: str, bags: Bags, folder: Path, seed: int, *more: str) -> di
     command = [sys.executable, str(Path(__file__).with_name("live.py")), str(bags.folder), str(folder)]
     with (folder / "live.said").open("ab") as log:
         child = subprocess.Popen(
-            [*command, "--seed", str(seed), *more], env=environment(mark), stdout=subprocess.PIPE, stderr=log, text=True
+            [*command, "--seed", str(seed), *more],
+            env=environment(mark),
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
         )
     lines = [json.loads(line) for line in child.stdout or ()]
     child.wait()
@@ -689,8 +694,8 @@ def run_trials(bags: Bags, out: Path, first: int, count: int, seconds: float, ki
         print(json.dumps(line), flush=True)
 
 
-def same_draw(bags: Bags, out: Path, rounds: int) -> None:
-    """Four replays at once whose processes draw the same random numbers, again and again."""
+def same_draw(bags: Bags, out: Path, rounds: int) -> list[str]:
+    """Four replays at once whose processes draw the same random numbers, again and again; return faults."""
     file = out / "same_draw.jsonl"
     before = "import random; random.seed({})"
     for number in range(len(read_lines(file)), rounds):
@@ -715,6 +720,7 @@ def same_draw(bags: Bags, out: Path, rounds: int) -> None:
         print(json.dumps(line), flush=True)
         if not faults:
             shutil.rmtree(folder)
+    return [fault for line in read_lines(file) for fault in line["faults"]]
 
 
 def two_graphs(bags: Bags, out: Path, circles: int, seed: int) -> list[str]:
@@ -739,6 +745,18 @@ def two_graphs(bags: Bags, out: Path, circles: int, seed: int) -> list[str]:
             file.write(json.dumps(line) + "\n")
             print(json.dumps(line), flush=True)
     return [fault for line in lines for fault in line["faults"]]
+
+
+def circles(bags: Bags, out: Path, count: int, seed: int) -> None:
+    """Circle after circle in one live graph that is recorded, with one to four kills in each."""
+    folder = out / f"circles_{seed}"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    more = ["--circles", str(count), "--kills", "0", "--kills-a-circle", "4"]
+    line = live_child(f"{os.getpid()}-circles", bags, folder, seed, *more)
+    with (out / "circles.jsonl").open("a", encoding="utf-8") as file:
+        file.write(json.dumps({"seed": seed, **line}) + "\n")
+    print(json.dumps(line), flush=True)
 
 
 def soak(bags: Bags, out: Path, seconds: float, seed: int) -> None:
@@ -779,21 +797,25 @@ def report(out: Path, tell: Callable[[str], None] = print) -> int:
     tell(f"grids that differ: {sum('differs' in fault or 'in place' in fault for _, fault in faults)}")
     tell(f"runs that hung: {sum('hung' in fault for _, fault in faults)}")
     tell(f"runs that failed: {sum(fault.startswith(('exit status', 'a traceback')) for _, fault in faults)}")
-    for name, what in (("recovered_s", "from a kill to its successor"), ("extra_s", "longer than undisturbed")):
+    seconds = {"recovered_s": "from a kill to its successor", "extra_s": "longer than undisturbed"}
+    for name, what in seconds.items():
         values = sorted(value for line in trials for value in line.get(name, ()))
         if values:
             p95 = values[int(0.95 * (len(values) - 1))]
-            tell(f"seconds {what}: median {statistics.median(values):.2f}, p95 {p95:.2f}, most {values[-1]:.2f}")
+            middle = statistics.median(values)
+            tell(f"seconds {what}: median {middle:.2f}, p95 {p95:.2f}, most {values[-1]:.2f}")
     for seed, fault in faults:
         tell(f"  {seed}: {fault}")
-    for name in ("same_draw", "two_graphs", "soak"):
+    for name in ("circles", "same_draw", "two_graphs", "soak"):
         if lines := read_lines(out / f"{name}.jsonl"):
             wrong = [fault for line in lines for fault in line["faults"]]
             faults += [(name, fault) for fault in wrong]
             tell(f"{name}: {len(lines)} lines, {len(wrong)} faults {wrong[:5]}")
             for line in lines:
-                if "memory" in line:
-                    tell(f"  {line['circles']} circles in {line['wall_s']} s; memory: {line['memory']}")
+                if "circles" in line:
+                    told = f"{line['circles']} circles in {line['wall_s']} s: {line['grids']} right grids"
+                    told += f", {len(line['kills'])} kills, {line.get('lost', 0)} views lost"
+                    tell(f"  {told}; {line.get('memory', '')}")
     return len(faults)
 
 
@@ -805,7 +827,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="seed of the first one")
     parser.add_argument("--kinds", default="", help=f"of {', '.join(dict.fromkeys(KINDS))}; default: all")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no trial after so long")
-    parser.add_argument("--soak", type=float, default=0.0, metavar="SECONDS", help="circles in one live graph")
+    parser.add_argument("--circles", type=int, default=0, help="in one live graph, with kills in each")
+    parser.add_argument("--soak", type=float, default=0.0, metavar="SECONDS", help="circles in one graph")
     parser.add_argument("--same-draw", type=int, default=0, metavar="ROUNDS", help="four replays at once")
     parser.add_argument("--two-graphs", type=int, default=0, metavar="CIRCLES", help="in one domain")
     parser.add_argument("--report", action="store_true", help="only say what the lines tell")
@@ -820,6 +843,8 @@ def main() -> int:
             same_draw(bags, given.out, given.same_draw)
         if given.two_graphs:
             two_graphs(bags, given.out, given.two_graphs, given.seed)
+        if given.circles:
+            circles(bags, given.out, given.circles, given.seed)
         if given.soak:
             soak(bags, given.out, given.soak, given.seed)
     return int(report(given.out) > 0)

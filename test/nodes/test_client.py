@@ -274,24 +274,32 @@ STAGE = """
 """
 
 
-# Not always within its time: sometimes the graph waits on after the kill (known, to be mended).
-@pytest.mark.long
-@pytest.mark.parametrize("stream", ["shadow_mask", "likelihood"])
+@pytest.mark.parametrize(
+    ("stream", "begun"),
+    [
+        ("shadow_mask", 1),
+        pytest.param("shadow_mask", 2, marks=pytest.mark.long),
+        pytest.param("shadow_mask", 5, marks=pytest.mark.long),
+        pytest.param("likelihood", 1, marks=pytest.mark.long),
+    ],
+)
 def test_the_results_of_an_outside_stage_are_carved_and_the_graph_completes_though_it_is_killed(
-    live: Callable[..., Live], tmp_path: Path, stream: str
+    live: Callable[..., Live], tmp_path: Path, stream: str, begun: int
 ) -> None:
     method = "consensus" if stream == "shadow_mask" else "soft"
     graph = live(shadow_likelihood=None, voxel_carver={"method": method})
     path = program(tmp_path, STAGE.replace("REFUSE", "False"))
     first = graph.start(path, stream)
-    graph.until(first.got(1), "it has begun")
+    graph.until(first.got(begun), "it has begun")
     first.kill()
     second = graph.start(path, stream)
     graph.until(lambda: graph.carved() == VIEWS, "the carver has every view")
     graph.until(lambda: graph.measurements is not None and graph.measurements.final, "there is a result")
     assert graph.measurements.views_used == VIEWS
     assert len({*first.stamps(), *second.stamps()}) == VIEWS
-    graph.until(lambda: len(graph.told("network")) == VIEWS, "every view is reported")
+    # The first may have been killed between a result, which was carved, and its report: it need not come.
+    alone = {int(stamp) for stamp in {*second.stamps()} - {*first.stamps()}}
+    graph.until(lambda: alone <= {*graph.told("network")}, "every view of the second is reported")
     assert set(graph.told("network").values()) == {"published"}
 
 

@@ -501,7 +501,10 @@ def test_a_replay_that_is_killed_with_a_node_of_its_graph_leaves_no_process_and_
     environment = {**os.environ, "PYTHONPATH": str(Path(module.__file__).parents[1])}
     command = [sys.executable, "-m", "csas_shadow_ros.cli", "replay", str(run_bag), "--out"]
     cli = subprocess.Popen(
-        [*command, str(tmp_path / "out")], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [*command, str(tmp_path / "out")],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     children = Path(f"/proc/{cli.pid}/task/{cli.pid}/children")
     nodes: dict[int, set[Path]] = {}
