@@ -75,8 +75,12 @@ class Peer:
 @dataclass
 class _Sent:
     at_s: float
-    first_done: int
+    #: How many views were done when it was sent last.
+    done_before: int
     attempts: int = 1
+    #: Attempts of which nothing was heard while others got through: only such ones tell that it vanished.
+    #: Where a stage is away nothing gets through, for however long.
+    vanished: int = 0
     overtaken: int = 0
     serial: int = 0
     due: bool = False
@@ -239,7 +243,9 @@ class Flow:
                 if twin and other is not peer and not other.alive:
                     del self.peers[other.instance]
                     self._reports.pop(other.key, None)
-        self.lost.clear()
+        if self.lost:
+            self.lost.clear()
+            self._recount()  # what was given up is missing again
         if name in self._names:
             # It was there and is there again: what was on its way meanwhile has probably died with it.
             for sent in self._in_flight.values():
@@ -409,7 +415,8 @@ class Flow:
         for stamp, sent in self._in_flight.items():
             if not self._is_due(sent, now):
                 continue
-            if sent.attempts >= self.max_attempts and self._done_count > sent.first_done:
+            sent.vanished += self._done_count > sent.done_before
+            if sent.vanished >= self.max_attempts:
                 reason = f"sent {sent.attempts} times, never reported though others were"
                 self.lost[stamp] = reason
                 self.notes.append(("error", f"view {stamp} ns is lost: {reason}"))
@@ -420,6 +427,7 @@ class Flow:
             self.resends += 1
             sent.attempts += 1
             sent.at_s, sent.serial, sent.overtaken, sent.due = now, self._serial, 0, False
+            sent.done_before = self._done_count
             return stamp
         if not fresh or self.held or len(self._in_flight) >= self.window:
             return None

@@ -261,6 +261,48 @@ def test_a_view_that_vanishes_again_and_again_while_others_pass_is_lost_with_an_
     assert flow.finished
 
 
+def test_no_view_is_lost_however_long_a_stage_is_away_that_was_killed_after_others_got_through() -> None:
+    flow, clock = make_flow(8, window=4, resend_s=1.0)
+    carver = Consumer(flow, stream="shadow_mask")
+    network = Consumer(flow, "network", "stage", "shadow")
+    wait(flow, clock, 0.25, carver, network)
+    assert take_all(flow) == [1, 2, 3, 4]
+    carver.report(1)  # the last thing that the network did was to pass the first one on
+    for _ in range(400):
+        wait(flow, clock, 1.0, carver)
+        take_all(flow)
+    assert not flow.lost
+    assert not flow.finished
+    second = Consumer(flow, "network", "stage", "shadow", n=2)
+    for _ in range(8):
+        wait(flow, clock, 0.25, carver, second)
+        for stamp in take_all(flow):
+            second.report(stamp)
+            carver.report(stamp)
+    assert flow.finished
+    assert flow.done == 8
+    assert not flow.lost
+
+
+def test_a_view_that_was_given_up_is_sent_again_to_whoever_comes() -> None:
+    flow, clock = make_flow(200, window=4, max_attempts=3)
+    sink = Consumer(flow)
+    flow.look()
+    while not flow.lost:
+        for stamp in take_all(flow):
+            if stamp != 7:
+                sink.report(stamp)
+    Consumer(flow, "network", "stage", "shadow")
+    assert not flow.lost
+    sent: list[int] = []
+    while not flow.finished:
+        wait(flow, clock, 0.25, sink)
+        for stamp in take_all(flow):
+            sent.append(stamp)
+            sink.report(stamp)
+    assert 7 in sent, "it is not forgotten without a word"
+
+
 def test_nothing_is_lost_while_a_stage_between_is_missing_however_long() -> None:
     flow, clock = make_flow(5, window=2)
     sink = Consumer(flow)
