@@ -194,22 +194,32 @@ class _Watcher:
         from msg_adapters import RclpyMessages
 
         from .nodes import qos
+        from .nodes.runtime.hearing import make_hearing
 
         self._qos = qos
         self._rclpy = rclpy
         self._messages = RclpyMessages()
-        self._context = Context()
         own = {k: v for k, v in graph.environment.items() if k.startswith(("ROS_", "FAST"))}
-        try:
-            with environment_of(own):
-                rclpy.init(context=self._context, domain_id=domain_id)
+
+        def make() -> Any:
+            context = Context()
+            try:
+                rclpy.init(context=context, domain_id=domain_id)
                 # Nobody would answer who asks for its parameters.
-                self._node = rclpy.create_node(
-                    "replay", context=self._context, namespace="csas", start_parameter_services=False
+                return rclpy.create_node(
+                    "replay", context=context, namespace="csas", start_parameter_services=False
                 )
-        except BaseException:
-            rclpy.try_shutdown(context=self._context)
-            raise
+            except BaseException:
+                rclpy.try_shutdown(context=context)
+                raise
+
+        def take_back(node: Any) -> None:
+            node.destroy_node()
+            rclpy.try_shutdown(context=node.context)
+
+        with environment_of(own):
+            self._node = make_hearing(make, take_back)
+        self._context = self._node.context
         self.beats: dict[tuple[str, str], Any] = {}
         self._dead: set[str] = set()
         self.rejected: dict[tuple[int, str], RejectedView] = {}

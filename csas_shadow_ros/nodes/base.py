@@ -69,6 +69,7 @@ from . import qos
 from .flow import Flow
 from .params import DYNAMIC, NODES, declare, from_overrides
 from .rivals import Rivals
+from .runtime.hearing import make_hearing
 from .runtime.host import Host
 
 NAMESPACE = "csas"
@@ -1236,21 +1237,33 @@ def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> in
     for number in (signal.SIGINT, signal.SIGTERM):
         # Not rclpy's handlers: they shut the context down before the node can say goodbye.
         signal.signal(number, lambda *_: stop.set())
-    context = Context()
     argv = [sys.argv[0], *(sys.argv[1:] if arguments is None else arguments)]
+
+    def make() -> CsasNode:
+        context = Context()
+        try:
+            rclpy.init(args=argv, context=context, signal_handler_options=SignalHandlerOptions.NO)
+        except RuntimeError as error:
+            # rclpy's own errors: arguments or a parameter file that cannot be read.
+            raise ParameterError(str(error)) from None
+        try:
+            return kind(context=context)
+        except BaseException:
+            rclpy.try_shutdown(context=context)
+            raise
+
+    def take_back(node: CsasNode) -> None:
+        node.destroy_node()
+        rclpy.try_shutdown(context=node.context)
+
     try:
-        rclpy.init(args=argv, context=context, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:
-        # rclpy's own errors: arguments or a parameter file that cannot be read.
+        node = make_hearing(make, take_back)
+    except ParameterError as error:
         sys.stderr.write(f"{kind.name}: {error}\n")
         return 2
+    context = node.context
     code = 0
     try:
-        try:
-            node = kind(context=context)
-        except ParameterError as error:
-            sys.stderr.write(f"{kind.name}: {error}\n")
-            return 2
         try:
             if node.parameters.autostart and not node.start():
                 sys.stderr.write(f"{kind.name}: {node.error or 'could not be started'}\n")

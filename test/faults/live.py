@@ -201,8 +201,9 @@ def go(given: argparse.Namespace) -> dict[str, Any]:
                     memory.setdefault("fork_server", []).append(memory_kb(server.pid))
                 with (given.folder / "memory.jsonl").open("a") as file:
                     file.write(json.dumps({k: v[-1] for k, v in memory.items()}) + "\n")
-                for old in sorted(given.folder.glob("recording*"), key=os.path.getmtime)[:-2]:
-                    shutil.rmtree(old)  # a soak would fill the disk
+                for old in given.folder.glob("recording*"):
+                    if (old / "metadata.yaml").exists():
+                        shutil.rmtree(old)  # a soak would fill the disk
             circle += 1
             with (given.folder / "circles.jsonl").open("a", encoding="utf-8") as file:
                 told = {k: v if isinstance(v, int) else len(v) for k, v in line.items()}

@@ -763,7 +763,7 @@ def soak(bags: Bags, out: Path, seconds: float, seed: int) -> None:
     """Circle after circle in one live graph: the memory of every process."""
     folder = out / "soak"
     folder.mkdir(parents=True, exist_ok=True)
-    more = ["--seconds", str(seconds), "--kills", "0", "--rest", "4"]
+    more = ["--seconds", str(seconds), "--kills", "0", "--rest", "1"]
     line = live_child(f"{os.getpid()}-soak", bags, folder, seed, *more)
     with (out / "soak.jsonl").open("a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")

@@ -525,6 +525,37 @@ def test_a_replay_that_is_killed_with_a_node_of_its_graph_leaves_no_process_and_
         time.sleep(0.05)
 
 
+def test_a_node_that_begins_while_another_process_holds_its_port_waits_until_it_hears(
+    domain: int, tmp_path: Path
+) -> None:
+    # As one that was killed just before does, on a busy machine.
+    port = Path(f"/dev/shm/fastrtps_port{7400 + 250 * domain + 11}_el")
+    with port.open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with Graph({"composites": {}}, domain, tmp_path) as graph:
+            pid = graph.processes["composites"].pid
+            deadline = time.monotonic() + 60
+            while "open_and_lock_file failed" not in graph.processes["composites"].log.read_text():
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+            fcntl.flock(lock, fcntl.LOCK_UN)
+            held: list[str] = []
+            while port.name not in held:
+                assert time.monotonic() < deadline, held
+                assert graph.processes["composites"].poll() is None
+                held = [os.path.basename(path) for path in links(pid)]
+                time.sleep(0.05)
+            assert len([name for name in held if "_port" in name and name.endswith("_el")]) == 2
+
+
+def links(pid: int) -> list[str]:
+    found = []
+    for entry in os.listdir(f"/proc/{pid}/fd"):
+        with contextlib.suppress(OSError):
+            found.append(os.readlink(f"/proc/{pid}/fd/{entry}"))
+    return found
+
+
 def test_a_graph_removes_what_a_killed_one_left_of_shared_memory_and_nothing_that_has_an_owner(
     domain: int, tmp_path: Path
 ) -> None:
