@@ -59,7 +59,8 @@ TEST += XARRAY
 # Archives: Parquet tables, questions to them in SQL, and clusters that process bags.
 ARCHIVE = ["pyarrow>=15", "duckdb>=1.1"]
 CLUSTER = ["distributed>=2024.1"]
-TEST += ARCHIVE + CLUSTER
+TEST += ARCHIVE
+TEST += CLUSTER
 # The benchmark compares with the fastest FFT library that can be had: a floor to measure against.
 BENCH = ["pyfftw>=0.14"]
 # setuptools 80 dropped what colcon's --symlink-install calls.

@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import re
 import signal
 import sys
 import time
@@ -16,7 +17,7 @@ from typing import Any, NoReturn
 
 from . import __version__
 from .core.errors import CsasError, ParameterError
-from .core.geometry.frames import SCENE_FRAME
+from .core.frame_name import SCENE_FRAME
 from .core.parameters import STAGES, START_FROM, PipelineParameters, PlaceParameters
 
 PROGRAM = "csas-shadow"
@@ -56,6 +57,11 @@ class _Command(argparse.ArgumentParser):
     """
 
     options: Callable[[argparse.ArgumentParser], None] | None = None
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        # A coordinate of -4e-05 m is a number and no option: argparse's own pattern knows no exponents.
+        self._negative_number_matcher = re.compile(r"-(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$", re.IGNORECASE)
 
     def parse_known_args(self, *args: Any, **kwargs: Any) -> Any:
         """Make the options, once, and parse."""
@@ -628,7 +634,9 @@ def _batch_options(p: argparse.ArgumentParser) -> None:
         metavar="GB",
         help="what each may take: a bag that needs more fails (default: 0.8 of the machine's memory, shared)",
     )
-    group.add_argument("--scheduler", metavar="ADDRESS", help="of a dask.distributed cluster, tcp://HOST:PORT")
+    group.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a dask.distributed cluster, tcp://HOST:PORT"
+    )
     group.add_argument("--scheduler-file", metavar="FILE", help="the file that its scheduler wrote")
     _parameter_options(p)
     _common(p)

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import fcntl
 import json
-import math
 import os
 import random
-import shutil
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -29,6 +25,16 @@ from msg_adapters.progress import GRAPH_ID
 
 from .core.errors import CsasError
 from .nodes.params import check, yaml_text
+from .nodes.runtime.shared_memory import (
+    LOCKED_S,
+    LONG_LOCKED_S,
+    bound,
+    free_shared_memory,
+    ports_of,
+    remove_ports,
+    remove_strays,
+    unused,
+)
 
 PACKAGE = "csas_shadow_ros"
 #: The ports of higher domains do not exist.
@@ -56,11 +62,7 @@ _GRACE_S, _PATIENCE_S = 5.0, 120.0
 #: With less shared memory than the segments of a graph may come to fill, a write into them is a bus error:
 #: then the middleware's own, smaller ones do, more slowly.
 _SHARED_MEMORY = 1 << 30
-#: The middleware's segments, and the name of the file that their owner holds locked.
-_SEGMENTS, _OWNER = "/dev/shm/fastrtps_", "_el"
-#: Who makes a segment holds its lock within milliseconds: one so old that nobody holds is nobody's. Of other
-#: graphs' processes, which may be stopped just then, it is taken for certain only much later.
-_LOCKED_S, _LONG_LOCKED_S = 1.0, 60.0
+
 #: Views are a few MB: by default glibc gives such memory back at once, and a quarter of the nodes' time went
 #: into getting it again, page by page.
 _MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(1 << 26), "MALLOC_TRIM_THRESHOLD_": str(1 << 28)}
@@ -113,22 +115,22 @@ class DomainReservation:
 
     def __init__(self, domain_id: int | None = None) -> None:
         if domain_id is not None:
-            held = _bound(_ports_of(domain_id)[0] + _HELD)
+            held = bound(ports_of(domain_id)[0] + _HELD)
             if held is None:
                 raise ReplayError(
                     f"ROS domain {domain_id} is taken by another replay on this machine (UDP port"
-                    f" {_ports_of(domain_id)[0] + _HELD}); expected a domain of its own"
+                    f" {ports_of(domain_id)[0] + _HELD}); expected a domain of its own"
                 )
             self.domain_id, self._held, self._own = domain_id, held, False
             return
         # Linux hands out ports from 32768 on to whoever asks: domains up to 101 lie below them.
         for domain in random.sample(range(1, 102), 101):
-            held = _bound(_ports_of(domain)[0] + _HELD)
+            held = bound(ports_of(domain)[0] + _HELD)
             if held is None:
                 continue
             self._own = True
             # Reserved first, then looked at: nobody else begins to use it in between.
-            if _unused(domain):
+            if unused(domain):
                 self.domain_id, self._held = domain, held
                 return
             held.close()
@@ -142,114 +144,14 @@ class DomainReservation:
 
     def close(self) -> None:
         """Let others have it, after their processes' end; what killed ones left of it is removed."""
-        if self._own and self._held.fileno() >= 0 and _unused(self.domain_id):
+        if self._own and self._held.fileno() >= 0 and unused(self.domain_id):
             remove_ports(self.domain_id)
         self._held.close()
-
-
-def _ports_of(domain_id: int) -> range:
-    """Return the UDP ports of a domain (the OMG's DDSI-RTPS, 9.6.1.1)."""
-    return range(7400 + 250 * domain_id, 7400 + 250 * (domain_id + 1))
-
-
-def _bound(port: int) -> socket.socket | None:
-    """Bind a UDP port, on all addresses and for this socket alone; None if somebody has it."""
-    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        made.bind(("", port))
-    except OSError:
-        made.close()
-        return None
-    return made
-
-
-def _unused(domain_id: int) -> bool:
-    """Say whether no participant of a domain runs here: each binds two ports of its own, or a shared one."""
-    ports = _ports_of(domain_id)
-    for port in (*ports[:2], *ports[10:]):
-        probe = _bound(port)
-        if probe is None:
-            return False
-        probe.close()
-    return True
 
 
 def new_graph_id() -> str:
     """Return an identity for a graph: its nodes' messages carry it, and its nodes refuse another's."""
     return uuid.uuid4().hex[:12]
-
-
-def free_shared_memory() -> int:
-    """Return how many bytes are free for shared memory: a container often has 64 MB of it."""
-    try:
-        return shutil.disk_usage("/dev/shm").free
-    except OSError:
-        return 0
-
-
-def segments_of(pid: int) -> set[Path]:
-    """Return the shared memory segments of the middleware that a process owns (not its ports)."""
-    found = set()
-    try:
-        for entry in os.listdir(f"/proc/{pid}/fd"):
-            with contextlib.suppress(OSError):
-                path = os.readlink(f"/proc/{pid}/fd/{entry}")
-                if path.startswith(_SEGMENTS) and path.endswith(_OWNER) and "_port" not in path:
-                    found.add(Path(path.removesuffix(_OWNER)))
-    except OSError:
-        pass  # it has ended
-    return found
-
-
-def remove_segment(segment: Path) -> None:
-    """Remove a segment that a killed process left; one that is gone already, or is owned, stays as it is."""
-    owner = segment.with_name(segment.name + _OWNER)
-    with contextlib.suppress(OSError), owner.open("rb") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        segment.unlink(missing_ok=True)
-        owner.unlink(missing_ok=True)
-
-
-def remove_strays(since_s: float = 0.0, until_s: float = math.inf) -> None:
-    """Remove this user's segments that were made in a span of time (s since 1970) and whose owner died.
-
-    A second old they must be: whoever makes one may not hold its lock yet.
-    """
-    folder = Path(_SEGMENTS).parent
-    for owner in folder.glob(f"{Path(_SEGMENTS).name}*{_OWNER}"):
-        with contextlib.suppress(OSError):
-            made = owner.stat()
-            mine = made.st_uid == os.getuid() and "_port" not in owner.name
-            if mine and since_s <= made.st_mtime <= min(until_s, time.time() - _LOCKED_S):
-                remove_segment(Path(str(owner).removesuffix(_OWNER)))
-
-
-def remove_ports(domain_id: int) -> None:
-    """Remove the ports in shared memory that killed processes left in a domain that nobody uses any more."""
-    for number in _ports_of(domain_id):
-        port = Path(f"{_SEGMENTS}port{number}")
-        owner = port.with_name(port.name + _OWNER)
-        with contextlib.suppress(OSError):
-            if owner.exists():
-                remove_segment(port)  # not one whose owner lives
-            if not owner.exists():
-                port.unlink(missing_ok=True)
-                port.with_name(f"sem.{port.name}_mutex").unlink(missing_ok=True)
-
-
-def tidy_up_after_a_killed_graph(domain_id: int, since_s: float) -> None:
-    """Remove the shared memory of a graph whose launching process was killed.
-
-    Parameters
-    ----------
-    domain_id : int
-        Its ROS domain.
-    since_s : float
-        When it began. Every node does this after its own end: the last one finds all the others'.
-    """
-    remove_strays(since_s)
-    if _unused(domain_id):
-        remove_ports(domain_id)
 
 
 def graph_environment(domain_id: int, log_dir: Path, graph_id: str = "") -> dict[str, str]:
@@ -737,7 +639,7 @@ class Graph:
     def __enter__(self) -> Graph:
         self._began_s = time.time()
         # What a graph left whose launching process was killed together with its nodes.
-        remove_strays(until_s=self._began_s - _LONG_LOCKED_S)
+        remove_strays(until_s=self._began_s - LONG_LOCKED_S)
         try:
             for process in sorted(self.processes.values(), key=lambda p: _START_ORDER.index(p.node)):
                 process.start()
@@ -772,7 +674,7 @@ class Graph:
             if process.restarts >= self.max_restarts:
                 raise ReplayError(f"{name} died {process.restarts + 1} times; {self.deaths[-1]}")
             process.start()
-        if self._death_s and time.time() > self._death_s + 1.1 * _LOCKED_S:
+        if self._death_s and time.time() > self._death_s + 1.1 * LOCKED_S:
             # Nobody else removes the shared memory of a process that was killed, before the next boot.
             self._death_s = 0.0
             remove_strays(self._began_s)
@@ -791,7 +693,7 @@ class Graph:
                     self._death_s = time.time()
             if self._death_s:
                 # Also of processes that were killed as soon as they had begun, or just now.
-                time.sleep(max(0.0, self._death_s + 1.1 * _LOCKED_S - time.time()))
+                time.sleep(max(0.0, self._death_s + 1.1 * LOCKED_S - time.time()))
                 remove_strays(self._began_s)
                 self._death_s = 0.0
         except BaseException:

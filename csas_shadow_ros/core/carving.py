@@ -490,8 +490,7 @@ class Carver:
             return first
         slope = self._slope(first)
         if slope is not None and slope.believed:
-            # Carve again from the same masks, over a seabed that slopes.
-            carver = self._again(lambda kept: KeptMask(slope.applied(kept.info), kept.packed))
+            carver = self._over(slope)
             first = carver.first_look()
         return replace(carver._shape(first) if first.occupied.any() else first, seabed=slope)
 
@@ -508,6 +507,10 @@ class Carver:
             if lowest <= v.z_m[-1]:
                 return None
         return slope
+
+    def _over(self, slope: SeabedSlope) -> Carver:
+        """Carve the same masks again, over a seabed that slopes."""
+        return self._again(lambda kept: KeptMask(slope.applied(kept.info), kept.packed))
 
     def _again(self, change: Callable[[KeptMask], KeptMask]) -> Carver:
         """Carve the same masks again, each changed."""
@@ -530,6 +533,10 @@ class Carver:
         leaner = lean.first_look()
         if leaner.occupied.any():
             leaner = lean._second_look(leaner)
+        return self._asked_for(leaner, fuller)
+
+    def _asked_for(self, leaner: VoxelGrid, fuller: VoxelGrid, others: Sequence[VoxelGrid] = ()) -> VoxelGrid:
+        """Add to the leaner of two bodies what of the fuller one explains shadow that nothing else does."""
         voxels = np.ascontiguousarray(np.argwhere(fuller.occupied & ~leaner.occupied), np.int32)
         if not len(voxels):
             return fuller
@@ -537,7 +544,7 @@ class Carver:
 
         def unexplained(kept: KeptMask) -> tuple[View, NDArray[np.bool_]]:
             view = kept.view()
-            return view, unexplained_shadow(view, self.volume, leaner.occupied)
+            return view, unexplained_shadow(view, [leaner, *others])
 
         for _, (view, dark) in in_order(unexplained, self._masks.values(), _LOOKERS):
             count_shadow_pixels(view, self.volume, voxels, dark, asked)
@@ -569,23 +576,53 @@ class Carver:
         """Threshold what has been carved so far, covered pixels unknown: what `grid` starts from."""
         return thresholded(self.volume, self.likelihood(), self._sums.count, self.parameters)
 
+    def beside(self, others: Sequence[VoxelGrid]) -> VoxelGrid:
+        """Threshold what has been carved so far, knowing what else stands there.
+
+        Taken for unknown, pixels that other bodies' echoes may cover leave an apron between near ones. Taken
+        for lit seabed they carve. What shadows ask for of the difference stays.
+        """
+        leaner = self.grid()
+        slope = leaner.seabed
+        carver = self if slope is None or not slope.believed else self._over(slope)
+        cleared = carver._clear_of(others)
+        if cleared is carver:
+            return leaner
+        first = cleared.first_look()
+        fuller = cleared._shape(first) if first.occupied.any() else first
+        return replace(carver._asked_for(leaner, fuller, others), seabed=slope)
+
+    def _clear_of(self, others: Sequence[VoxelGrid]) -> Carver:
+        """Carve the same masks again, lit pixels that other bodies' echoes may cover as unknown.
+
+        A top as faint as the seabed that is laid over a shadow says nothing of the seabed there. Taken for
+        lit seabed it removes the upper part of the body whose shadow it is, in all views along their line.
+        """
+        echoes = [_Echoes(grid.occupied, grid.volume) for grid in others if grid.occupied.any()]
+        if not echoes or not self._masks:
+            return self
+
+        def cleared(kept: KeptMask) -> KeptMask:
+            view = kept.view()
+            lit = (view.pixels == MASK_OUTSIDE) | (view.pixels == MASK_COVERED)
+            lit &= np.logical_or.reduce([one.zone(kept) for one in echoes])
+            if not lit.any():
+                return kept
+            return KeptMask.of(replace(view, pixels=np.where(lit, np.uint8(MASK_UNKNOWN), view.pixels)))
+
+        return self._again(cleared)
+
     def _second_look(self, first: VoxelGrid) -> VoxelGrid:
         """Carve again what the first look left, with the pixels that its own echo cannot cover as seabed."""
-        box, part = part_around(first.occupied, self.volume, _SECOND_LOOK_VOXELS)
-        body = first.occupied[box]
+        echoes = _Echoes(first.occupied, self.volume, _SECOND_LOOK_VOXELS)
+        box, part = echoes.box, echoes.part
         sums = _Sums(part, self._pool)
-        opaque: dict[int, NDArray[np.bool_]] = {}
-        for kept in self._masks.values():
-            # The grazing angle hardly changes round the circle: one body a quarter of a degree.
-            quarters = kept.grazing_quarters
-            if quarters not in opaque:
-                opaque[quarters] = opaque_part(body, math.radians(quarters / 4.0))
 
         def look(kept: KeptMask) -> tuple[View, NDArray[np.bool_]]:
             view = kept.view()
             if not (view.pixels == MASK_COVERED).any():
                 return view, _NOWHERE
-            return view, echo_zone(kept.info, part, body, opaque[kept.grazing_quarters])
+            return view, echoes.zone(kept)
 
         for _, (view, zone) in in_order(look, self._masks.values(), _LOOKERS):
             sums.add_mask(view.pixels, view.info, zone)
@@ -593,6 +630,24 @@ class Carver:
         likelihood[box] = _mean(sums.total, sums.count, self.parameters, len(self.stamps))
         views[box] = sums.count
         return thresholded(self.volume, likelihood, views, self.parameters)
+
+
+class _Echoes:
+    """Where a carved body may echo, view by view."""
+
+    def __init__(self, occupied: NDArray[np.bool_], volume: Volume, margin: int = 0) -> None:
+        self.box, self.part = part_around(occupied, volume, margin)
+        self._body = occupied[self.box]
+        self._opaque: dict[int, NDArray[np.bool_]] = {}
+
+    def zone(self, kept: KeptMask) -> NDArray[np.bool_]:
+        """Mark the pixels of a view that its echo may cover."""
+        # The grazing angle hardly changes round the circle: one body a quarter of a degree.
+        quarters = kept.grazing_quarters
+        opaque = self._opaque.get(quarters)
+        if opaque is None:
+            opaque = self._opaque[quarters] = opaque_part(self._body, math.radians(quarters / 4.0))
+        return echo_zone(kept.info, self.part, self._body, opaque)
 
 
 def _mean(

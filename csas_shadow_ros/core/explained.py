@@ -123,23 +123,22 @@ def _about(pixels: BoolArray, mask: View) -> BoolArray:
     return np.asarray(cv2.dilate(pixels.view(np.uint8), box).view(np.bool_))
 
 
-def unexplained_shadow(mask: View, volume: Volume, occupied: BoolArray) -> BoolArray:
-    """Mark the segmented shadow of a view that a body does not cast.
+def unexplained_shadow(mask: View, grids: Sequence[VoxelGrid]) -> BoolArray:
+    """Mark the segmented shadow of a view that no body casts.
 
     Parameters
     ----------
     mask : View
         Shadow mask, shape (rows, cols).
-    volume : Volume
-        The body's lattice.
-    occupied : ndarray of bool, shape (nz, ny, nx)
-        The body.
+    grids : sequence of VoxelGrid
+        The bodies.
 
     Returns
     -------
     ndarray of bool, shape (rows, cols)
     """
-    return np.asarray((mask.pixels == MASK_SHADOW) & ~_about(cast_shadow(mask, volume, occupied), mask))
+    cast = np.logical_or.reduce([cast_shadow(mask, grid.volume, grid.occupied) for grid in grids])
+    return np.asarray((mask.pixels == MASK_SHADOW) & ~_about(cast, mask))
 
 
 def shadow_fit(mask: View, grids: Sequence[VoxelGrid]) -> ShadowFit:

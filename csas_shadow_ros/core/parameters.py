@@ -10,10 +10,12 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 from .errors import ParameterError
-from .geometry.place import Datum
+
+if TYPE_CHECKING:
+    from .geometry.place import Datum
 
 P = TypeVar("P", bound="Parameters")
 
@@ -304,6 +306,8 @@ class PlaceParameters(Parameters):
             What topic origin says. Latitude and longitude that are given come before it; a heading that is
             given turns it.
         """
+        from .geometry.place import Datum  # late: the command line knows parameters before it loads numpy
+
         self.check()
         if self.given:
             heading = 0.0 if math.isnan(self.origin_heading_deg) else self.origin_heading_deg

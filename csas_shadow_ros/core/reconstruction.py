@@ -146,13 +146,13 @@ class Body:
             while len(self._waiting) > _WAITING:
                 self._waiting.popitem(last=False)
 
-    def shape(self) -> tuple[VoxelGrid, VoxelGrid | None]:
-        """Return what carving leaves, and what the other method leaves if it was asked for.
+    def shape(self, others: Sequence[VoxelGrid] = ()) -> tuple[VoxelGrid, VoxelGrid | None]:
+        """Return what carving leaves beside other bodies, and what the other method leaves.
 
         Thin and faint bodies are too little for silhouettes and still darken the mean of all views, by which
         the search finds them. Where silhouettes leave nothing, that mean tells what is there.
         """
-        own = self.carver.grid()
+        own = self.carver.beside(others) if others else self.carver.grid()
         other = self.other.grid() if self.other is not None and self.other.stamps else None
         silhouettes = self.carver.parameters.takes_masks
         if silhouettes and other is not None and other.occupied.any() and not own.occupied.any():
@@ -402,10 +402,11 @@ class Reconstruction:
             best_shadow=self._best[1],
             frame=self.frame or SCENE_FRAME,
         )
+        shapes = self._shapes() if final else {}
         if self.stamps:
             body = self.bodies[0]
             if final:
-                result.grid, result.other_grid = body.shape()
+                result.grid, result.other_grid = shapes[0]
             else:
                 result.grid = body.carver.first_look()
             result.timings_s["carve"] = time.perf_counter() - began
@@ -421,8 +422,8 @@ class Reconstruction:
                 result.timings_s["shape"] = time.perf_counter() - began - result.timings_s["carve"]
         if final and len(self.bodies) > 1:
             since = time.perf_counter()
-            for body in self.bodies[1:]:
-                self._add_objects(result, body)
+            for number, body in enumerate(self.bodies[1:], start=1):
+                self._add_objects(result, body, shapes[number][0] if number in shapes else None)
             result.timings_s["objects"] = time.perf_counter() - since
         if final and result.objects and self.stamps:
             since = time.perf_counter()
@@ -475,17 +476,32 @@ class Reconstruction:
         hollow = bool((result.grid.occupied & ~matter).any())
         result.matter_mesh = matter_mesh(result.grid, matter) if hollow else result.mesh
 
+    def _shapes(self) -> dict[int, tuple[VoxelGrid, VoxelGrid | None]]:
+        """Return the grid of each body by its number, and by the other method where it was asked for.
+
+        Where there are several objects each is carved again without what the others' echoes may cover.
+        """
+        usable = {n: body for n, body in enumerate(self.bodies) if body.carver.stamps and not body.given_up}
+        shapes = {n: body.shape() for n, body in usable.items()}
+        objects: dict[int, list[VoxelGrid]] = {}
+        for n, (grid, _) in shapes.items():
+            told = [one for found in objects.values() for one in found]
+            objects[n] = objects_of(grid, self.bodies[n].target.position_m, told)[0] if n else [grid]
+        for n in shapes if sum(map(bool, objects.values())) > 1 else ():
+            others = [one for other, found in objects.items() if other != n for one in found]
+            shapes[n] = usable[n].shape(others)
+        return shapes
+
     @staticmethod
-    def _add_objects(result: Result, body: Body) -> None:
+    def _add_objects(result: Result, body: Body, whole: VoxelGrid | None) -> None:
         """Add what a further body turned out to be, without what was reported before it."""
         place = body.target.position_m
         if body.given_up:
             result.left_out.append(LeftOut(place, NOTHING_LEFT))
             return
-        if not body.carver.stamps:
+        if whole is None:
             result.left_out.append(LeftOut(place, f"no view of it was usable: {body.refused}"))
             return
-        whole = body.carver.grid()
         found, left_out = objects_of(whole, place, [o.grid for o in result.objects])
         result.left_out += left_out
         for grid in found:

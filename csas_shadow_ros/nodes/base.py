@@ -71,6 +71,7 @@ from .params import DYNAMIC, NODES, declare, from_overrides
 from .rivals import Rivals
 from .runtime.hearing import make_hearing
 from .runtime.host import Host
+from .runtime.shared_memory import tidy_up_after_a_killed_graph
 
 NAMESPACE = "csas"
 BEAT_S = 0.5
@@ -1281,8 +1282,6 @@ def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> in
         domain_id = context.get_domain_id() if context.ok() else None
         rclpy.try_shutdown(context=context)
         if _is_orphan() and domain_id is not None:
-            from csas_shadow_ros.graph import tidy_up_after_a_killed_graph
-
             tidy_up_after_a_killed_graph(domain_id, float(os.environ["CSAS_SINCE_S"]))
     return code
 

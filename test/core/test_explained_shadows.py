@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from core_data import ground_of_pixels, hidden_by_box, iou, make_info
 
-from csas_shadow_ros.core.carving import carve
+from csas_shadow_ros.core.carving import Carver, carve
 from csas_shadow_ros.core.echo import layover_per_metre
 from csas_shadow_ros.core.explained import cast_shadow, shadow_fit, unexplained_shadow
 from csas_shadow_ros.core.geometry import View
@@ -102,8 +102,8 @@ def test_what_a_body_does_not_cast_is_unexplained():
     info = INFOS[18]  # from the north: the halves stand side by side
     mask = mask_of(info)
     whole, half = box_voxels(), box_voxels(high=(0.0, 0.3, 0.15))
-    assert unexplained_shadow(mask, VOLUME, whole).sum() == 0
     grid = carve([mask_of(one) for one in INFOS], VOLUME, CarvingParameters())
+    assert unexplained_shadow(mask, [replace(grid, occupied=whole)]).sum() == 0
     right = shadow_fit(mask, [replace(grid, occupied=whole)])
     less = shadow_fit(mask, [replace(grid, occupied=half)])
     more = shadow_fit(mask, [replace(grid, occupied=box_voxels(high=(0.45, 0.3, 0.3)))])
@@ -116,6 +116,30 @@ def test_what_a_body_does_not_cast_is_unexplained():
     # Two bodies explain together what each alone does not.
     other = replace(grid, occupied=whole & ~half)
     assert shadow_fit(mask, [replace(grid, occupied=half), other]).unexplained == 0.0
+
+
+def test_a_faint_top_behind_a_shadow_is_not_taken_for_lit_seabed():
+    # In line with the sonar the top of the farther box, laid over, lies on the shadow of the nearer one.
+    near, far = ((-0.2, -0.15, 0.0), (0.2, 0.15, 0.3)), ((0.6, -0.2, 0.0), (1.0, 0.2, 0.3))
+    volume = Volume.around((0.0, 0.0), (0.9, 0.8, 0.5), 0.025)
+    beyond = Volume.around((0.8, 0.0), (0.7, 0.7, 0.5), 0.025)
+    carver = Carver(volume, CarvingParameters())
+    for info in INFOS:
+        x, y = ground_of_pixels(info.camera)
+        top, _ = lit_top(info, *far)
+        shadow = hidden_by_box(x, y, info.camera.sonar_m, *near)
+        carver.integrate(View(info, np.where(shadow & ~top, MASK_SHADOW, MASK_OUTSIDE).astype(np.uint8)))
+    truth = box_voxels(*near, volume=volume)
+    alone = carver.grid()
+    behind = box_voxels(*far, volume=beyond)
+    other = replace(alone, volume=beyond, occupied=behind)
+    assert iou(alone.occupied, truth) < 0.75, "or the scene shows nothing"
+    beside = carver.beside([other])
+    layers = truth.any(axis=(1, 2)).sum()
+    assert iou(beside.occupied[:layers], truth[:layers]) > 0.9
+    # What is far off changes nothing.
+    far_off = replace(other, volume=Volume.around((30.0, 0.0), (0.7, 0.7, 0.5), 0.025))
+    assert np.array_equal(carver.beside([far_off]).occupied, alone.occupied)
 
 
 def test_near_covered_pixels_are_those_within_a_stretchs_own_length():

@@ -233,7 +233,7 @@ class Command:
 
     def nodes(self) -> dict[int, str]:
         """Return the processes that it has started, by name; notes what shared memory they have."""
-        from csas_shadow_ros.graph import segments_of
+        from csas_shadow_ros.nodes.runtime.shared_memory import segments_of
 
         found = {pid: name_of(pid) for pid in children_of(self.process.pid)}
         for pid in (self.process.pid, *found):

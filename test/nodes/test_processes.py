@@ -35,9 +35,9 @@ from csas_shadow_ros.graph import (
     GraphProcess,
     ReplayError,
     graph_environment,
-    segments_of,
     start_fork_server,
 )
+from csas_shadow_ros.nodes.runtime.shared_memory import segments_of
 from csas_shadow_ros.replay import replay
 from csas_shadow_ros.simulation import SimulatedRun
 

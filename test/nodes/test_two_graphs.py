@@ -18,13 +18,13 @@ pytest.importorskip("rclpy")
 from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M, Graph
 
 import csas_shadow_ros
-from csas_shadow_ros import graph as processes
 from csas_shadow_ros.bags import write_run
 from csas_shadow_ros.core.pipeline import ProcessedView, Result, run
 from csas_shadow_ros.graph import DomainReservation, ReplayError
 from csas_shadow_ros.nodes.bag_player import BagPlayerNode
 from csas_shadow_ros.nodes.bag_recorder import BagRecorderNode
 from csas_shadow_ros.nodes.rivals import Rivals
+from csas_shadow_ros.nodes.runtime.shared_memory import unused
 from csas_shadow_ros.nodes.shadow_enhancement import ShadowEnhancementNode
 from csas_shadow_ros.nodes.shadow_likelihood import ShadowLikelihoodNode
 from csas_shadow_ros.nodes.sub_aperture import SubApertureNode
@@ -55,7 +55,7 @@ def test_the_same_draw_of_random_numbers_leaves_each_a_domain_of_its_own() -> No
 def test_a_domain_in_which_a_participant_of_this_machine_runs_is_not_taken(graph: Graph) -> None:
     graph.plain_node("somebody")
     graph._domain.close()  # as of a graph that nobody reserved a domain for
-    assert not processes._unused(graph.domain_id)
+    assert not unused(graph.domain_id)
     state = random.getstate()
     for seed in range(1000):
         random.seed(seed)

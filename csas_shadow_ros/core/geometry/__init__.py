@@ -9,13 +9,13 @@ downwards. See ``docs/conventions.md``.
 
 from __future__ import annotations
 
+from ..frame_name import SCENE_FRAME
 from .camera import (
     ShadowCamera,
     shadow_matrix,
     view_ground_to_pixel,
 )
 from .frames import (
-    SCENE_FRAME,
     TWO_PI,
     Acoustics,
     FloatArray,

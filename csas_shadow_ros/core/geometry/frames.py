@@ -13,8 +13,6 @@ from ..errors import GeometryError, ParameterError, check_range
 
 FloatArray = NDArray[np.float64]
 
-#: The scene frame's name where nobody gives another one.
-SCENE_FRAME = "csas_scene"
 
 TWO_PI = 2.0 * math.pi
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import GeometryError, TrackError, check_range
-from .frames import SCENE_FRAME, FloatArray, one_frame, wrap_angle
+from ..frame_name import SCENE_FRAME
+from .frames import FloatArray, one_frame, wrap_angle
 from .track import Track
 
 IntArray = NDArray[np.int64]

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import TrackError, check_range
-from .frames import SCENE_FRAME, TWO_PI, FloatArray, wrap_angle
+from ..frame_name import SCENE_FRAME
+from .frames import TWO_PI, FloatArray, wrap_angle
 
 
 @dataclass(frozen=True)

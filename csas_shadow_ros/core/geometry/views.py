@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import GeometryError
+from ..frame_name import SCENE_FRAME
 from .camera import ShadowCamera
-from .frames import SCENE_FRAME, TWO_PI, Acoustics, FloatArray, GroundGrid, down_range_axis
+from .frames import TWO_PI, Acoustics, FloatArray, GroundGrid, down_range_axis
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.frames import SCENE_FRAME
+from ..geometry import SCENE_FRAME
 from ..mesh import Dimensions
 from ..volume import Target, VoxelGrid
 

@@ -1,0 +1,118 @@
+"""Shared memory and ports of the middleware: whose they are, and what killed processes left of them."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import math
+import os
+import shutil
+import socket
+import time
+from pathlib import Path
+
+#: The middleware's segments, and the name of the file that their owner holds locked.
+_SEGMENTS, _OWNER = "/dev/shm/fastrtps_", "_el"
+#: Who makes a segment holds its lock within milliseconds: one so old that nobody holds is nobody's. Of other
+#: graphs' processes, which may be stopped just then, it is taken for certain only much later.
+LOCKED_S, LONG_LOCKED_S = 1.0, 60.0
+
+
+def ports_of(domain_id: int) -> range:
+    """Return the UDP ports of a domain (the OMG's DDSI-RTPS, 9.6.1.1)."""
+    return range(7400 + 250 * domain_id, 7400 + 250 * (domain_id + 1))
+
+
+def bound(port: int) -> socket.socket | None:
+    """Bind a UDP port, on all addresses and for this socket alone; None if somebody has it."""
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        made.bind(("", port))
+    except OSError:
+        made.close()
+        return None
+    return made
+
+
+def unused(domain_id: int) -> bool:
+    """Say whether no participant of a domain runs here: each binds two ports of its own, or a shared one."""
+    ports = ports_of(domain_id)
+    for port in (*ports[:2], *ports[10:]):
+        probe = bound(port)
+        if probe is None:
+            return False
+        probe.close()
+    return True
+
+
+def free_shared_memory() -> int:
+    """Return how many bytes are free for shared memory: a container often has 64 MB of it."""
+    try:
+        return shutil.disk_usage("/dev/shm").free
+    except OSError:
+        return 0
+
+
+def segments_of(pid: int) -> set[Path]:
+    """Return the shared memory segments of the middleware that a process owns (not its ports)."""
+    found = set()
+    try:
+        for entry in os.listdir(f"/proc/{pid}/fd"):
+            with contextlib.suppress(OSError):
+                path = os.readlink(f"/proc/{pid}/fd/{entry}")
+                if path.startswith(_SEGMENTS) and path.endswith(_OWNER) and "_port" not in path:
+                    found.add(Path(path.removesuffix(_OWNER)))
+    except OSError:
+        pass  # it has ended
+    return found
+
+
+def remove_segment(segment: Path) -> None:
+    """Remove a segment that a killed process left; one that is gone already, or is owned, stays as it is."""
+    owner = segment.with_name(segment.name + _OWNER)
+    with contextlib.suppress(OSError), owner.open("rb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        segment.unlink(missing_ok=True)
+        owner.unlink(missing_ok=True)
+
+
+def remove_strays(since_s: float = 0.0, until_s: float = math.inf) -> None:
+    """Remove this user's segments that were made in a span of time (s since 1970) and whose owner died.
+
+    A second old they must be: whoever makes one may not hold its lock yet.
+    """
+    folder = Path(_SEGMENTS).parent
+    for owner in folder.glob(f"{Path(_SEGMENTS).name}*{_OWNER}"):
+        with contextlib.suppress(OSError):
+            made = owner.stat()
+            mine = made.st_uid == os.getuid() and "_port" not in owner.name
+            if mine and since_s <= made.st_mtime <= min(until_s, time.time() - LOCKED_S):
+                remove_segment(Path(str(owner).removesuffix(_OWNER)))
+
+
+def remove_ports(domain_id: int) -> None:
+    """Remove the ports in shared memory that killed processes left in a domain that nobody uses any more."""
+    for number in ports_of(domain_id):
+        port = Path(f"{_SEGMENTS}port{number}")
+        owner = port.with_name(port.name + _OWNER)
+        with contextlib.suppress(OSError):
+            if owner.exists():
+                remove_segment(port)  # not one whose owner lives
+            if not owner.exists():
+                port.unlink(missing_ok=True)
+                port.with_name(f"sem.{port.name}_mutex").unlink(missing_ok=True)
+
+
+def tidy_up_after_a_killed_graph(domain_id: int, since_s: float) -> None:
+    """Remove the shared memory of a graph whose launching process was killed.
+
+    Parameters
+    ----------
+    domain_id : int
+        Its ROS domain.
+    since_s : float
+        When it began. Every node does this after its own end: the last one finds all the others'.
+    """
+    remove_strays(since_s)
+    if unused(domain_id):
+        remove_ports(domain_id)
