@@ -120,7 +120,7 @@ def run(
     """Reconstruct the target of a circular run, and what else stands there, from their shadows.
 
     `progress` is called with (views done, views in all), `on_view` with every view in order of aspect. At
-    most `max_objects` bodies are carved, which changes nothing of the target's result. `spectrum` is the
+    most `max_objects` bodies are carved, each knowing where the others' echoes lie. `spectrum` is the
     image's, if it was made before; `run_ns` names the run (by default: stamp of the track's first pose).
 
     Raises

@@ -487,9 +487,11 @@ class Reconstruction:
         for n, (grid, _) in shapes.items():
             told = [one for found in objects.values() for one in found]
             objects[n] = objects_of(grid, self.bodies[n].target.position_m, told)[0] if n else [grid]
-        for n in shapes if sum(map(bool, objects.values())) > 1 else ():
+        # What falls to pieces, or is a phantom in part, gets no more: shadows of others would ask for it.
+        for n in [n for n, found in objects.items() if any(one is shapes[n][0] for one in found)]:
             others = [one for other, found in objects.items() if other != n for one in found]
-            shapes[n] = usable[n].shape(others)
+            if others:
+                shapes[n] = usable[n].shape(others)
         return shapes
 
     @staticmethod
