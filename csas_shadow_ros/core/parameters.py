@@ -116,7 +116,7 @@ class Parameters:
 
     @classmethod
     def from_mapping(cls: type[P], values: Mapping[str, Any]) -> P:
-        """Make a parameter set from a mapping; unknown names are refused.
+        """Make a parameter set from a mapping, such as a report's; unknown names are refused.
 
         Raises
         ------
@@ -127,7 +127,9 @@ class Parameters:
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise ParameterError(f"unknown parameter {unknown[0]!r}; expected one of: {', '.join(known)}")
-        made = cls(**values)
+        optional = {f.name for f in dataclasses.fields(cls) if f.metadata["optional"]}
+        # JSON knows no NaN: a report tells an optional number that was not given as null.
+        made = cls(**{n: math.nan if v is None and n in optional else v for n, v in values.items()})
         made.check()
         return made
 

@@ -14,6 +14,7 @@ from csas_shadow_ros.core.parameters import (
     LikelihoodParameters,
     Parameters,
     PipelineParameters,
+    PlaceParameters,
     SubApertureParameters,
     TargetParameters,
     bounded,
@@ -174,3 +175,11 @@ def test_every_error_has_one_root():
     raised = [e for e in vars(errors).values() if isinstance(e, type) and issubclass(e, Exception)]
     assert len(raised) > 5
     assert all(issubclass(e, CsasError) for e in raised)
+
+
+def test_what_a_report_tells_as_null_is_an_optional_number_that_was_not_given():
+    read = PlaceParameters.from_mapping({"origin_lat_deg": None, "origin_lon_deg": None})
+    assert math.isnan(read.origin_lat_deg)
+    assert not read.given
+    with pytest.raises(ParameterError, match="step_deg is None"):
+        SubApertureParameters.from_mapping({"step_deg": None})

@@ -18,6 +18,7 @@ def sound(line: dict) -> bool:
     return not line["faults"] and not line["lost"]
 
 
+@pytest.mark.long
 def test_a_replay_whose_processes_are_killed_and_whose_launcher_is_leaves_the_right_grid(bags, tmp_path):
     # Kills nodes, then the launching process, then gives the same command again.
     line = Trial(1, bags, tmp_path / "launcher", "launcher").go()

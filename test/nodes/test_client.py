@@ -244,7 +244,8 @@ def test_a_classifier_that_is_ended_in_order_says_goodbye_and_nobody_waits_for_i
     outside.end()
     assert len(outside.stamps()) < VIEWS
     graph.until(lambda: graph.carved() == VIEWS, "the run ends without it")
-    assert graph.beats["classifier", "shadow"].values["leaving"] == "true"
+    beats = graph.beats
+    graph.until(lambda: beats["classifier", "shadow"].values.get("leaving") == "true", "its goodbye is heard")
 
 
 #: Takes the place of `shadow_likelihood`; refuses every ninth view in one way, and every ninth in another.
