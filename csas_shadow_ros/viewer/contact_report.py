@@ -414,7 +414,7 @@ def _lay_out(figure: Figure, sheet: Sheet) -> None:
         left,
         0.568,
         f"Amber: segmented shadow. Blue: shadow that the shape casts. Grey: {_LOW:g} to +{_HIGH:g} dB over"
-        " the view's median. Hue: from which side it is bright.",
+        " the view's median.\nHue: from which side it is bright.",
         fontsize=7,
         color="#444444",
     )
