@@ -155,7 +155,9 @@ class ViewerServer:
             # A page that has stopped reading would keep what it was sent, and the socket, for ever.
             for transport in open_yet:
                 transport.abort()
-            await asyncio.sleep(0)
+            # A socket is closed a turn of the loop after its transport; one that was just accepted, two later.
+            for _ in range(4):
+                await asyncio.sleep(0)
 
     def _app(self) -> web.Application:
         app = web.Application(middlewares=[self._guard], client_max_size=_MOST_POSTED)

@@ -225,7 +225,9 @@ def test_every_object_has_its_entry_its_line_its_grid_and_its_mesh(tmp_path):
     assert len(alone.json["objects"]) == 1
     assert "no more than 1" in alone.json["objects_left_out"][0]["reason"]
     assert not (tmp_path / "alone" / "object_2.stl").exists()
-    assert alone.json["dimensions"] == report["dimensions"]
+    # Alone it does not know of the other's echo, which takes a little of it away.
+    for name in ("length_m", "width_m", "height_m"):
+        assert alone.json["dimensions"][name] == pytest.approx(report["dimensions"][name], abs=0.03)
     assert run_quickly(bag, tmp_path / "none", "--max-objects", 0).code == 1
 
 
