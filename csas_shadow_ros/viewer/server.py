@@ -155,7 +155,7 @@ class ViewerServer:
             # A page that has stopped reading would keep what it was sent, and the socket, for ever.
             for transport in open_yet:
                 transport.abort()
-            # A socket is closed a turn of the loop after its transport; one that was just accepted, two later.
+            # A socket closes a turn of the loop after its transport; one that was just accepted, two later.
             for _ in range(4):
                 await asyncio.sleep(0)
 
