@@ -576,13 +576,12 @@ class Carver:
         """Threshold what has been carved so far, covered pixels unknown: what `grid` starts from."""
         return thresholded(self.volume, self.likelihood(), self._sums.count, self.parameters)
 
-    def beside(self, others: Sequence[VoxelGrid]) -> VoxelGrid:
-        """Threshold what has been carved so far, knowing what else stands there.
+    def beside(self, leaner: VoxelGrid, others: Sequence[VoxelGrid]) -> VoxelGrid:
+        """Add to what `grid` left what is asked for once it is known what else stands there.
 
         Taken for unknown, pixels that other bodies' echoes may cover leave an apron between near ones. Taken
         for lit seabed they carve. What shadows ask for of the difference stays.
         """
-        leaner = self.grid()
         slope = leaner.seabed
         carver = self if slope is None or not slope.believed else self._over(slope)
         cleared = carver._clear_of(others)

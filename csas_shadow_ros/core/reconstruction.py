@@ -146,14 +146,25 @@ class Body:
             while len(self._waiting) > _WAITING:
                 self._waiting.popitem(last=False)
 
-    def shape(self, others: Sequence[VoxelGrid] = ()) -> tuple[VoxelGrid, VoxelGrid | None]:
-        """Return what carving leaves beside other bodies, and what the other method leaves.
+    def shape(self) -> tuple[VoxelGrid, VoxelGrid | None]:
+        """Return what carving leaves, and what the other method leaves if it was asked for.
 
         Thin and faint bodies are too little for silhouettes and still darken the mean of all views, by which
         the search finds them. Where silhouettes leave nothing, that mean tells what is there.
         """
-        own = self.carver.beside(others) if others else self.carver.grid()
         other = self.other.grid() if self.other is not None and self.other.stamps else None
+        return self._told(self.carver.grid(), other)
+
+    def beside(
+        self, alone: tuple[VoxelGrid, VoxelGrid | None], others: Sequence[VoxelGrid]
+    ) -> tuple[VoxelGrid, VoxelGrid | None]:
+        """Return the same as `shape`, which gave `alone`, knowing what else stands there."""
+        told, other = alone
+        if other is not None and told.method != self.carver.parameters.method:
+            told, other = other, told
+        return self._told(self.carver.beside(told, others), other)
+
+    def _told(self, own: VoxelGrid, other: VoxelGrid | None) -> tuple[VoxelGrid, VoxelGrid | None]:
         silhouettes = self.carver.parameters.takes_masks
         if silhouettes and other is not None and other.occupied.any() and not own.occupied.any():
             return other, own
@@ -491,7 +502,7 @@ class Reconstruction:
         for n in [n for n, found in objects.items() if any(one is shapes[n][0] for one in found)]:
             others = [one for other, found in objects.items() if other != n for one in found]
             if others:
-                shapes[n] = usable[n].shape(others)
+                shapes[n] = usable[n].beside(shapes[n], others)
         return shapes
 
     @staticmethod

@@ -134,12 +134,12 @@ def test_a_faint_top_behind_a_shadow_is_not_taken_for_lit_seabed():
     behind = box_voxels(*far, volume=beyond)
     other = replace(alone, volume=beyond, occupied=behind)
     assert iou(alone.occupied, truth) < 0.75, "or the scene shows nothing"
-    beside = carver.beside([other])
+    beside = carver.beside(alone, [other])
     layers = truth.any(axis=(1, 2)).sum()
     assert iou(beside.occupied[:layers], truth[:layers]) > 0.9
     # What is far off changes nothing.
     far_off = replace(other, volume=Volume.around((30.0, 0.0), (0.7, 0.7, 0.5), 0.025))
-    assert np.array_equal(carver.beside([far_off]).occupied, alone.occupied)
+    assert np.array_equal(carver.beside(alone, [far_off]).occupied, alone.occupied)
 
 
 def test_near_covered_pixels_are_those_within_a_stretchs_own_length():
