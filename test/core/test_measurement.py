@@ -309,12 +309,12 @@ def test_views_that_agree_by_chance_tell_no_height_where_sides_are_not_straight(
     sides = sides_of(BOX, ONE_LOOK)
     measured = measure_object(grid, mesh_from_grid(grid), sides)
     cap = cap_of(grid, GRAZING)
-    told = upright_height(sides, measured, cap, 0.012, VOLUME.voxel_size_m)
+    told = upright_height(sides, measured, [cap.begins_m], 0.012, VOLUME.voxel_size_m)
     assert told == pytest.approx(0.25, abs=0.008)
     rounded = [replace(side, shapes=("round",) * len(side.shapes)) for side in sides]
-    assert upright_height(rounded, measured, cap, 0.012, VOLUME.voxel_size_m) is None
+    assert upright_height(rounded, measured, [cap.begins_m], 0.012, VOLUME.voxel_size_m) is None
     untold = [replace(side, shapes=()) for side in sides]
-    assert upright_height(untold, measured, cap, 0.012, VOLUME.voxel_size_m) is None
+    assert upright_height(untold, measured, [cap.begins_m], 0.012, VOLUME.voxel_size_m) is None
 
 
 def test_shadow_lengths_behind_walls_that_are_not_upright_do_not_tell_the_height():

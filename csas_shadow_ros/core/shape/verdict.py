@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..mesh import Dimensions
 from ..volume import VoxelGrid
 from .result import Quality, Result
 
@@ -93,9 +96,53 @@ def judge(result: Result) -> None:
         if result.final and result.dimensions is not None and not result.dimensions.intervals:
             reasons.append("too few sides of shadows were seen for intervals")
             worst = max(worst, 1)
+    if beside := [*_pieces(result), *_in_shadow(result)]:
+        reasons += beside
+        worst = max(worst, 1)
     # Semicolons separate reasons where they travel as one text: none may hold one.
     told_reasons = tuple(reason.replace(";", ",") for reason in reasons)
     result.quality = Quality(("good", "limited", "not trustworthy")[worst], told_reasons)
+
+
+def _pieces(result: Result) -> list[str]:
+    """Name the further objects that silhouettes do not measure: pieces of what was carved as one body."""
+    if not result.final:
+        return []
+    return [
+        f"object {number} has no intervals: it is a piece of what was carved together, its sizes are rough"
+        for number, one in enumerate(result.further, start=2)
+        if not one.dimensions.intervals
+    ]
+
+
+def _in_shadow(result: Result) -> list[str]:
+    """Name the objects of which one stands in the other's shadow from some aspect.
+
+    That shadow then ends on a body, not on the seabed: both are carved and measured with what is left of them.
+    """
+    sonars = np.array([one.sonar_m for one in result.evidence.values()])
+    found = result.objects
+    if not result.final or not len(sonars) or len(found) < 2:
+        return []
+    place = np.asarray(found[0].dimensions.position_m)
+    away = np.hypot(*(sonars[:, :2] - place).T)
+    reach = float(np.median(away / sonars[:, 2]))  # of a shadow, for each metre of height
+    named: set[int] = set()
+    for (m, one), (n, two) in itertools.combinations(enumerate((o.dimensions for o in found), start=1), 2):
+        between = np.subtract(two.position_m, one.position_m)
+        gap = float(np.hypot(*between)) - _half_along(one, between) - _half_along(two, between)
+        if gap < reach * max(one.height_m, two.height_m):
+            named |= {m, n}
+    if not named:
+        return []
+    *first, last = map(str, sorted(named))
+    return [f"objects {', '.join(first)} and {last} stand in one another's shadow from some aspects"]
+
+
+def _half_along(size: Dimensions, way: NDArray[np.float64]) -> float:
+    """Return how far a plan's rectangle reaches from its middle that way, m."""
+    turned = math.atan2(way[1], way[0]) - size.heading_rad
+    return 0.5 * (size.length_m * abs(math.cos(turned)) + size.width_m * abs(math.sin(turned)))
 
 
 def _candidates(result: Result) -> list[str]:
