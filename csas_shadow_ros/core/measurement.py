@@ -99,7 +99,8 @@ _CAP_SLACK = (0.2, 0.3)
 #: How gradually it begins tells a dome: between these two, voxels under the cap's top.
 _DOME_SLACK = (0.5, 2.0)
 #: Walls are upright if more than this share of the silhouettes' sides are straight and of the views tell one
-#: height, to its error, which is within so many voxels of a flat top as the carved cap or the contours tell it.
+#: height, to its error, which is within so many voxels of a flat top as the carved cap or the contours tell
+#: it.
 _MOST, _UPRIGHT_VOXELS = 0.5, 2.0
 #: The height that upright walls tell: this percentile of the views, the middle of their higher half (a view
 #: that sees something else narrower at its top tells too little).
