@@ -50,14 +50,16 @@ def sphere(info, radius=0.5):
 @pytest.mark.parametrize(("shape", "top_m", "round_top"), [(flat_top, 0.2, False), (sphere, 1.0, True)])
 def test_both_ends_of_the_shadow_give_the_height_of_an_edge_and_of_a_round_top(shape, top_m, round_top):
     told = contour_height([(info, shape(info)) for info in FINE], (0.0, 0.0), 2.0)
-    assert told is not None and told.round_top is round_top
+    assert told is not None
+    assert told.round_top is round_top
     assert told.height_m == pytest.approx(top_m, abs=0.01)
     assert abs(told.height_m - top_m) < 1.96 * told.sigma_m
 
 
 def test_a_top_that_cells_are_too_coarse_to_tell_round_from_flat_may_be_either():
     told = contour_height([(info, sphere(info, 0.35)) for info in INFOS], (0.0, 0.0), 2.0)
-    assert told is not None and told.round_top is None
+    assert told is not None
+    assert told.round_top is None
     assert abs(told.height_m - 0.7) < 1.96 * told.sigma_m
 
 
@@ -69,7 +71,8 @@ def test_views_that_disagree_tell_no_height():
 
 def test_no_height_is_told_above_what_the_shadows_leave():
     told = contour_height([(info, flat_top(info)) for info in INFOS], (0.0, 0.0), 0.19)
-    assert told is not None and told.height_m == 0.19
+    assert told is not None
+    assert told.height_m == 0.19
 
 
 def test_a_contour_ends_where_its_column_s_last_shadow_does():
@@ -80,7 +83,8 @@ def test_a_contour_ends_where_its_column_s_last_shadow_does():
     shadow[120:160, 90:130] = True
     shadow[140, 100] = False  # a speckle
     found = contour_of(shadow, info)
-    assert found is not None and len(found.across_m) == 40
+    assert found is not None
+    assert len(found.across_m) == 40
     row_m = info.camera.spacing_m[0]
     # The segmented shadow begins most of a cell behind the end of the top's echo.
     assert np.ptp(found.begin_m) == 0.0
@@ -112,7 +116,8 @@ def test_a_low_wide_box_seen_steeply_is_not_as_high_as_its_cap():
         SubApertureParameters(step_deg=6.0), carving=CarvingParameters(voxel_size_m=0.03)
     )
     measured = run(made.image, made.track, parameters).dimensions
-    assert measured is not None and measured.hull_top_m > 0.3
+    assert measured is not None
+    assert measured.hull_top_m > 0.3
     assert measured.height_m == pytest.approx(0.17, abs=0.02)
     low, high = measured.intervals["height_m"]
     assert low < 0.17 < high

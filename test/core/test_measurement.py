@@ -243,6 +243,24 @@ def test_an_interval_holds_its_measure_and_widens_with_scattered_sides():
     assert halves[1] > 1.1 * halves[0]
 
 
+def test_crumbs_beside_a_body_are_not_measured_where_the_views_are_shifted_against_one_another():
+    x, y, z = VOLUME.x_m, VOLUME.y_m, VOLUME.z_m[:, None, None]
+    inside = (np.abs(x)[None, :] <= 0.2) & (np.abs(y)[:, None] <= 0.15)
+    crumbs = (np.abs(y) <= 0.02)[:, None] & (x > 0.2)[None, :] & (x < 0.34)[None, :]
+    occupied = (inside | crumbs)[None] & (z < 0.25)
+    rng = np.random.default_rng(5)
+    box = lambda p: 0.2 * np.abs(np.cos(p)) + 0.15 * np.abs(np.sin(p))  # noqa: E731
+    sides = [
+        replace(side, support_m=tuple(v + rng.normal(0.0, 0.08) for v in side.support_m))
+        for side in drawn_sides(box)
+    ]
+    grid = grid_of(occupied)
+    measured = measure_object(grid, mesh_from_grid(grid), sides)
+    assert measured.scatter_cells > 1.0
+    assert measured.length_m == pytest.approx(0.4, abs=0.03)
+    assert measured.width_m == pytest.approx(0.3, abs=0.03)
+
+
 def test_the_same_views_in_any_order_give_the_same_measures():
     occupied = hull_of(BOX, INFOS, VOLUME)
     grid = grid_of(occupied)

@@ -118,7 +118,7 @@ def _pieces(result: Result) -> list[str]:
 def _in_shadow(result: Result) -> list[str]:
     """Name the objects of which one stands in the other's shadow from some aspect.
 
-    That shadow then ends on a body, not on the seabed: both are carved and measured with what is left of them.
+    That shadow then ends on a body, not on the seabed: both are carved and measured with what is left.
     """
     sonars = np.array([one.sonar_m for one in result.evidence.values()])
     found = result.objects
