@@ -61,6 +61,11 @@ ARCHIVE = ["pyarrow>=15", "duckdb>=1.1"]
 CLUSTER = ["distributed>=2024.1"]
 TEST += ARCHIVE
 TEST += CLUSTER
+# Charts: GeoTIFF and vectors by GDAL, labelled arrays as NetCDF and Zarr.
+MAPS = ["rasterio>=1.3.10", "pyogrio>=0.7.2", "h5netcdf>=1.3", "h5py>=3.10", "zarr>=2.16", *XARRAY]
+TEST += MAPS
+# Read back what was written, as users do.
+TEST += ["geopandas>=0.14.3"]
 # The benchmark compares with the fastest FFT library that can be had: a floor to measure against.
 BENCH = ["pyfftw>=0.14"]
 # setuptools 80 dropped what colcon's --symlink-install calls.
@@ -144,6 +149,7 @@ setup(
         "xarray": XARRAY,
         "archive": ARCHIVE,
         "cluster": ARCHIVE + CLUSTER,
+        "maps": MAPS,
         "test": TEST,
         "bench": BENCH,
         "build": BUILD,

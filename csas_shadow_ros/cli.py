@@ -299,6 +299,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_run(add)
     _add_replay(add)
     _add_archive(add)
+    _add_export(add)
     _add_view(add)
     _add_report(add)
     warm = add(
@@ -639,6 +640,34 @@ def _batch_options(p: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--scheduler-file", metavar="FILE", help="the file that its scheduler wrote")
     _parameter_options(p)
+    _common(p)
+
+
+def _add_export(add: Callable[..., argparse.ArgumentParser]) -> None:
+    add(
+        "export",
+        "write a results folder for charts: GeoTIFF, GeoJSON, GeoPackage, KML, Zarr, NetCDF",
+        "  csas-shadow export box_results --out box_maps\n"
+        "  csas-shadow export box_results --out box_maps --format geotiff,gpkg --overwrite\n"
+        "  csas-shadow export box_results --out box_maps --origin-lat-deg 48.38 --origin-lon-deg -4.49\n\n"
+        "without --format all that the run can be written in; what it lacks is told. With it, what the run\n"
+        "lacks makes exit code 3. docs/maps.md says what is in the files.",
+        _export,
+        _export_options,
+    )
+
+
+def _export_options(p: argparse.ArgumentParser) -> None:
+    p.add_argument("result", metavar="RESULT", help="a results folder")
+    p.add_argument("--out", required=True, metavar="FOLDER", help="folder to make")
+    p.add_argument(
+        "--format",
+        default="",
+        metavar="LIST",
+        help="of geotiff, geojson, gpkg, kml, zarr, netcdf, with commas (default: all that can be)",
+    )
+    p.add_argument("--overwrite", action="store_true", help="replace a folder of maps that is there")
+    add_parameters(p, {"place": STAGES["place"]})
     _common(p)
 
 
@@ -1056,6 +1085,21 @@ def _find(arguments: argparse.Namespace, console: Console) -> int:
     rows, text = find(arguments)
     console.result(text, json_ready(rows))
     return OK
+
+
+def _export(arguments: argparse.Namespace, console: Console) -> int:
+    from .maps import export_result
+
+    formats = [name.strip() for name in arguments.format.split(",") if name.strip()]
+    place = PlaceParameters.from_mapping(given_parameters(arguments))
+    done = export_result(arguments.result, arguments.out, formats, place=place, overwrite=arguments.overwrite)
+    console.result(str(done), dataclasses.asdict(done))
+    for name, why in done.left_out.items():
+        if formats:
+            print(f"{PROGRAM}: error: {name}: {why}", file=sys.stderr)
+        else:
+            console.notice(f"left out: {name}: {why}")
+    return PARTIAL if formats and done.left_out else OK
 
 
 def _replay(arguments: argparse.Namespace, console: Console) -> int:

@@ -143,7 +143,7 @@ def rows_of(folder: Path, record: Record | None, root: Path) -> Rows:
             continue
         try:
             report = read_report(place)
-            one, contacts = _rows_of_report(report, base, place.relative_to(root).as_posix())
+            one, contacts = rows_of_report(report, base, place.relative_to(root).as_posix())
         except (CsasError, OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             why = f"results cannot be read: {brief(error)}"
             rows.runs.append({**base, "status": FAILED_STATUS, "reason": why})
@@ -187,7 +187,7 @@ def _base(record: Record, part: PartOfTask) -> dict[str, Any]:
     }
 
 
-def _rows_of_report(
+def rows_of_report(
     report: Mapping[str, Any], base: Mapping[str, Any], results: str
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     quality, views, given = report["quality"], report["views"], report.get("input") or {}
