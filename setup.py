@@ -63,7 +63,10 @@ TEST += ARCHIVE
 TEST += CLUSTER
 # Charts: GeoTIFF and vectors by GDAL, labelled arrays as NetCDF and Zarr.
 MAPS = ["rasterio>=1.3.10", "pyogrio>=0.7.2", "h5netcdf>=1.3", "h5py>=3.10", "zarr>=2.16", *XARRAY]
+# Images and navigation of others.
+IMPORT = ["rasterio>=1.3.10", "h5py>=3.10", 'sarkit>=1.0; python_version >= "3.11"']
 TEST += MAPS
+TEST += IMPORT
 # Read back what was written, as users do.
 TEST += ["geopandas>=0.14.3"]
 # The benchmark compares with the fastest FFT library that can be had: a floor to measure against.
@@ -150,6 +153,7 @@ setup(
         "archive": ARCHIVE,
         "cluster": ARCHIVE + CLUSTER,
         "maps": MAPS,
+        "import": IMPORT,
         "test": TEST,
         "bench": BENCH,
         "build": BUILD,

@@ -299,6 +299,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_run(add)
     _add_replay(add)
     _add_archive(add)
+    _add_import(add)
     _add_export(add)
     _add_view(add)
     _add_report(add)
@@ -640,6 +641,30 @@ def _batch_options(p: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--scheduler-file", metavar="FILE", help="the file that its scheduler wrote")
     _parameter_options(p)
+    _common(p)
+
+
+def _add_import(add: Callable[..., argparse.ArgumentParser]) -> None:
+    p = add(
+        "import",
+        "make a run's bag of an image and navigation that other programs wrote",
+        "  csas-shadow import image.npy --out my_run --geometry geometry.yaml\n"
+        "  csas-shadow import image.tif --out my_run --geometry geometry.yaml --track mission.mcap\n\n"
+        "SOURCE is a complex image (.npy .npz .mat .h5 .tif .ntf), the track a CSV file or a bag with\n"
+        "Odometry, poses, fixes or transforms. docs/import.md tells of the page of geometry.",
+        _import,
+    )
+    p.add_argument("source", metavar="SOURCE", help="the full-circle complex image")
+    p.add_argument("--out", required=True, metavar="BAG", help="rosbag2 directory to make")
+    p.add_argument("--geometry", required=True, metavar="YAML", help="what the image does not say of itself")
+    p.add_argument("--track", metavar="FILE|BAG", help="navigation, instead of the one that the page names")
+    p.add_argument(
+        "--encoding",
+        default="32FC2",
+        choices=("32FC2", "64FC2", "16SC2", "8SC2"),
+        help="of the image in the bag (default 32FC2)",
+    )
+    p.add_argument("--overwrite", action="store_true", help="replace a bag that is there")
     _common(p)
 
 
@@ -1084,6 +1109,24 @@ def _find(arguments: argparse.Namespace, console: Console) -> int:
 
     rows, text = find(arguments)
     console.result(text, json_ready(rows))
+    return OK
+
+
+def _import(arguments: argparse.Namespace, console: Console) -> int:
+    from .bags import read_run
+    from .importing import import_run
+
+    bag = import_run(
+        arguments.source,
+        arguments.out,
+        arguments.geometry,
+        track=arguments.track,
+        encoding=arguments.encoding,
+        overwrite=arguments.overwrite,
+    )
+    run = read_run(bag)
+    problems = [str(problem) for problem in run.problems]
+    console.result(str(run), {"bag": str(bag.resolve()), "problems": problems})
     return OK
 
 
