@@ -62,7 +62,7 @@ CLUSTER = ["distributed>=2024.1"]
 TEST += ARCHIVE
 TEST += CLUSTER
 # Charts: GeoTIFF and vectors by GDAL, labelled arrays as NetCDF and Zarr.
-MAPS = ["rasterio>=1.3.10", "pyogrio>=0.7.2", "h5netcdf>=1.3", "h5py>=3.10", "zarr>=2.16", *XARRAY]
+MAPS = ["rasterio>=1.3.10", "pyogrio>=0.7.2", "h5netcdf>=1.3", "h5py>=3.10", "zarr>=2.18", "xarray>=2024.10"]
 # Images and navigation of others.
 IMPORT = ["rasterio>=1.3.10", "h5py>=3.10", 'sarkit>=1.0; python_version >= "3.11"']
 TEST += MAPS

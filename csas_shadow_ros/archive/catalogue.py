@@ -1,7 +1,8 @@
 """The catalogue: two Parquet tables, a row a run and a row an object, that any tool reads as they are.
 
 Rows that come are written as small parts and merged into the tables now and then, so that neither memory nor
-writing grows with the archive. Nothing is only in here: `rebuild` makes it from the folders.
+writing grows with the archive: a merge reads, joins and writes a row group at a time, and sorts nothing.
+Nothing is only in here: `rebuild` makes it from the folders.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ _MERGE_SHARE, _MERGE_ROWS = 0.1, 1000
 #: Rows of a row group: what a reader takes into memory at once.
 _GROUP = 10_000
 #: Memory (bytes) of the merge; beyond it, it goes to the disk.
-_MERGE_MEMORY = "256MB"
+_MERGE_MEMORY = "128MB"
 
 
 def _arrow() -> tuple[Any, Any]:
@@ -57,7 +58,10 @@ def connection(folder: Path) -> Any:
         "threads": 1,
         "preserve_insertion_order": False,
     }
-    return duckdb.connect(config=settings)
+    db = duckdb.connect(config=settings)
+    # On stdout, where the answer goes: of any question that takes two seconds.
+    db.execute("SET enable_progress_bar = false")
+    return db
 
 
 def schema_of(table: str) -> Any:
@@ -169,12 +173,14 @@ class Catalogue:
             return
         with connection(self.archive.root) as db:
             every = _every(main if main.exists() else None, parts)
-            yield from db.execute(
+            found = db.execute(
                 f"""WITH every AS ({every}), newest AS ({_NEWEST})
                 SELECT task, any_value(signature), any_value(options), any_value(version),
                        bool_or(status = '{FAILED_STATUS}'), count(*)
                 FROM every SEMI JOIN newest USING (task, finished, src) GROUP BY task"""
-            ).fetchall()
+            )
+            while rows := found.fetchmany(_GROUP):
+                yield from rows
 
     def merge(self, *, anew: bool = False) -> int:
         """Merge the parts into the tables and write ``failed.txt``; return how many runs there are.
@@ -212,9 +218,9 @@ class Catalogue:
                         mine = [p.parents[1] / table.partition(".")[0] / p.name for p in parts]
                         rows = db.sql(
                             f"SELECT * EXCLUDE (src) FROM ({_every(mains[table] if there else None, mine)})"
-                            " SEMI JOIN chosen USING (task, finished, src) ORDER BY time, bag, number"
+                            " SEMI JOIN chosen USING (task, finished, src)"
                         )
-                        for batch in pa.RecordBatchReader.from_stream(rows):
+                        for batch in _batches(rows):
                             total += batch.num_rows if table == RUNS else 0
                             points = _points(batch.column(lat).to_pylist(), batch.column(lon).to_pylist())
                             whole = [
@@ -242,6 +248,13 @@ class Catalogue:
             [str(runs)],
         ).fetchall()
         replace_text(self.archive.failed, "".join(failed_line(*row) for row in failed))
+
+
+def _batches(rows: Any) -> Iterator[Any]:
+    """Iterate the rows of a query, a row group at a time."""
+    # DuckDB renamed it, and warns of the old name.
+    read = rows.to_arrow_reader if hasattr(rows, "to_arrow_reader") else rows.fetch_arrow_reader
+    yield from read(_GROUP)
 
 
 def failed_line(bag: str, number: int, reason: str) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -16,7 +18,7 @@ import pyarrow.parquet as pq
 
 from csas_shadow_ros import parameters, process_bag
 from csas_shadow_ros.archive import catalogue as catalogue_module
-from csas_shadow_ros.archive.catalogue import Catalogue, rebuild
+from csas_shadow_ros.archive.catalogue import Catalogue, connection, rebuild
 from csas_shadow_ros.archive.find import Found, QueryError, table_of
 from csas_shadow_ros.archive.layout import Archive, ArchiveError
 from csas_shadow_ros.archive.rows import CONTACT_COLUMNS, RUN_COLUMNS, Rows
@@ -26,6 +28,8 @@ from csas_shadow_ros.core.geometry import Datum
 from csas_shadow_ros.results import read_report
 
 BREST = Datum(48.36, -4.55)
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -257,3 +261,49 @@ def test_the_command_line_finds(results, tmp_path, capsys):
     assert len(capsys.readouterr().out.splitlines()) == 2
     assert main(["find", str(tmp_path), "--where", "nothing"]) == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_question_that_takes_long_puts_no_bar_into_the_answer(tmp_path):
+    with connection(tmp_path) as db:
+        assert db.execute("SELECT current_setting('enable_progress_bar')").fetchall() == [(False,)]
+
+
+_MERGE = """
+import resource, sys
+import pyarrow as pa, pyarrow.parquet as pq
+from csas_shadow_ros.archive.catalogue import Catalogue, schema_of, TABLES
+from csas_shadow_ros.archive.layout import Archive
+
+archive, parts = Archive(sys.argv[1]), int(sys.argv[2])
+archive.make()
+catalogue = Catalogue(archive)
+for part in range(parts):
+    numbers = range(part * 5000, (part + 1) * 5000)
+    for table in TABLES:
+        schema = schema_of(table)
+        kinds = {pa.string(): lambda n: f"{n:064d}", pa.timestamp("us"): int, pa.int64(): int}
+        columns = {
+            field.name: pa.array([kinds[field.type](n) for n in numbers], field.type)
+            if field.type in kinds else pa.nulls(5000, field.type)
+            for field in schema
+        }
+        folder = archive.parts / table.partition(".")[0]
+        folder.mkdir(parents=True, exist_ok=True)
+        data = pa.table(columns, schema=schema)
+        pq.write_table(data, folder / f"{part:020d}-1-1.parquet", compression="zstd")
+del columns
+assert catalogue.merge() == 5000 * parts
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000.0)
+"""
+
+
+@pytest.mark.long
+def test_the_memory_of_a_merge_does_not_grow_with_the_catalogue(tmp_path):
+    def megabytes(parts: int) -> float:
+        command = [sys.executable, "-c", _MERGE, str(tmp_path / str(parts)), str(parts)]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+        assert done.returncode == 0, done.stderr
+        return float(done.stdout)
+
+    # 90 000 more rows of 2 kB are 180 MB: what is sorted or held whole is at least that.
+    assert megabytes(20) - megabytes(2) < 120.0
