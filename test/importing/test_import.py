@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,8 @@ from routes import (
 import csas_shadow_ros as csas
 from csas_shadow_ros.cli import main
 from csas_shadow_ros.core.sector import same_grid
-from csas_shadow_ros.importing import ImportSettingsError, import_run
+from csas_shadow_ros.importing import ImportSettingsError, Settings, import_run
+from csas_shadow_ros.importing.settings import KEYS
 
 BAND = {"centre_frequency_hz": 60e3, "bandwidth_hz": 24e3, "sound_speed_mps": 1500.0, "spectrum_sign": 1}
 COARSE = csas.parameters(step_deg=30.0, voxel_size_m=0.04)
@@ -283,3 +285,13 @@ def test_a_sicd_says_itself_where_its_reference_point_is(run, tmp_path):
     )
     there = run.image.grid.x_of_columns()[200], run.image.grid.y_of_rows()[300]
     assert (x, y) == pytest.approx(there, abs=1e-6)
+
+
+def test_the_page_in_the_documents_is_one_and_every_key_is_told_of():
+    text = (Path(__file__).resolve().parents[2] / "docs" / "import.md").read_text(encoding="utf-8")
+    (page,) = re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    settings = Settings(yaml.safe_load(page))
+    assert settings.number("acoustics", "centre_frequency_hz") == 60e3
+    assert settings.mapping("track", "columns")["down"] == "depth"
+    untold = [key for keys in KEYS.values() for key in keys if not re.search(rf"\b{key}\b", text)]
+    assert not untold
