@@ -699,16 +699,17 @@ def _export_options(p: argparse.ArgumentParser) -> None:
 def _add_view(add: Callable[..., argparse.ArgumentParser]) -> None:
     p = add(
         "view",
-        "look at a results folder or a bag in a browser: circular sliders, layers, ruler, 3-D",
+        "look at a results folder, a bag or an archive in a browser: circular sliders, layers, ruler, 3-D",
         "  csas-shadow view box_results\n"
         "  csas-shadow view box_results/result.mcap --no-browser --port 8765\n"
         "  csas-shadow view box_results --html box.html --every 5\n"
-        "  csas-shadow view monday_results friday_results\n\n"
+        "  csas-shadow view monday_results friday_results\n"
+        "  csas-shadow view season\n\n"
         "ends with Ctrl-C. Listens on this machine alone unless --host says otherwise; the network is asked\n"
         "for the token that is then printed. For a live graph: ros2 run csas_shadow_ros viewer",
         _view,
     )
-    p.add_argument("path", metavar="DIR|BAG", help="a results folder, or a bag that holds views")
+    p.add_argument("path", metavar="DIR|BAG", help="results, a bag that holds views, or an archive of batch")
     p.add_argument(
         "compare", nargs="?", metavar="OTHER", help="a second run of the same contact, to compare it with"
     )
@@ -868,6 +869,7 @@ def _report(arguments: argparse.Namespace, console: Console) -> int:
 
 
 def _view(arguments: argparse.Namespace, console: Console) -> int:
+    from .archive.layout import is_archive
     from .viewer import command
 
     if arguments.html is not None:
@@ -888,6 +890,20 @@ def _view(arguments: argparse.Namespace, console: Console) -> int:
         console.result(url, {"url": url})
         sys.stdout.flush()
 
+    if is_archive(arguments.path):
+        from .archive_page import view_archive
+
+        if arguments.compare is not None:
+            raise ParameterError(f"{arguments.path} is an archive; expected one alone, or two runs of it")
+        view_archive(
+            arguments.path,
+            host=arguments.host,
+            port=arguments.port,
+            token=arguments.token,
+            browser=not arguments.no_browser,
+            say=say,
+        )
+        return OK
     command.view(
         arguments.path,
         second=arguments.compare,

@@ -74,6 +74,11 @@ class Found:
         )
         self._rows = self._db.table("found")
 
+    def afresh(self) -> Found:
+        """Take all rows again."""
+        self._rows = self._db.table("found")
+        return self
+
     def where(self, expression: str) -> Found:
         """Keep the rows for which an SQL expression over the columns is true.
 
@@ -160,6 +165,20 @@ class Found:
         )
         self._rows = self._db.table("seen")
         return self
+
+    def count(self) -> int:
+        """Return how many rows there are."""
+        return int(self._rows.aggregate("count(*)").fetchall()[0][0])
+
+    def columns(self, names: Sequence[str], limit: int) -> list[tuple[Any, ...]]:
+        """Return some columns of the rows, in no order."""
+        rows: list[tuple[Any, ...]] = self._rows.project(", ".join(names)).limit(limit).fetchall()
+        return rows
+
+    def values(self, name: str) -> list[str]:
+        """Return what a column holds, each value once."""
+        rows = self._rows.filter(f"{name} IS NOT NULL").project(name).distinct().order(name).fetchall()
+        return [str(row[0]) for row in rows]
 
     def rows(self, limit: int | None = None) -> list[dict[str, Any]]:
         """Return the rows as dictionaries, in time."""

@@ -245,6 +245,11 @@ def _locked(path: Path) -> Iterator[bool]:
         os.close(number)
 
 
+def is_archive(path: str | Path) -> bool:
+    """Say whether a folder is an archive."""
+    return Archive(path).exists
+
+
 def walk(root: Path) -> Iterator[tuple[Path, Record | None]]:
     """Iterate the folders of tasks below a folder, and results folders that no task made (record None)."""
     try:
