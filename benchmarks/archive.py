@@ -29,7 +29,7 @@ SERIAL = 10
 
 def make_runs(folder: Path, count: int) -> list[Path]:
     """Write so many bags, all different, every tenth broken in a way of its own; return the sound ones."""
-    from broken import KINDS, broken, sound
+    from broken import FAULTS, KINDS, broken, sound
 
     from csas_shadow_ros.simulation import simulate
 
@@ -38,7 +38,8 @@ def make_runs(folder: Path, count: int) -> list[Path]:
     for number in range(count):
         run = scenes[number % len(scenes)]
         if number % 10 == 9:
-            kind = KINDS[number // 10 % len(KINDS)]
+            # Of a second round only what differs from the first: bags that hold the same are one.
+            kind = [*KINDS, *FAULTS][min(number // 10, len(KINDS) + number // 10 % len(FAULTS))]
             broken(run, folder / f"{number:04d}_{kind}", kind, number)
         else:
             made.append(sound(run, folder / f"{number:04d}", number))
