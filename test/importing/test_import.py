@@ -95,6 +95,7 @@ def test_an_imported_run_gives_the_grid_of_the_bag(tiny_box_bag, tmp_path):
     assert np.array_equal(own.matter, other.matter)
 
 
+@pytest.mark.long  # the track itself is held by the tests before
 def test_positions_that_round_leave_the_grid_what_it_is(tiny_box_bag, tmp_path):
     one = imported(tiny_box_bag.run, tmp_path, IMAGES["geotiff_on_a_chart"], NAVIGATION["csv_geographic"])
     # The search weighs bodies against thresholds: where it ends may turn on the last bit of a position.

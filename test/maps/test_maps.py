@@ -164,6 +164,7 @@ def test_the_chart_is_the_plane_of_the_scene(place, heading_deg, altitude_m):
         assert metres < (0.001 if altitude_m > -1000 else 0.01)
 
 
+@pytest.mark.long  # its numbers are held by the test before
 def test_a_scene_that_is_turned_is_turned_on_the_chart(results, tmp_path):
     place = PlaceParameters(origin_lat_deg=10.0, origin_lon_deg=20.0, origin_heading_deg=90.0)
     done = export_result(results, tmp_path / "maps", ["geotiff", "geojson", "gpkg", "netcdf"], place=place)

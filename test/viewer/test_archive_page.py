@@ -175,6 +175,7 @@ def test_a_token_is_asked_for_of_the_archive_and_of_its_runs(serve_archive: Any)
     assert ask(opened.partition("?")[0])[0] == 401
 
 
+@pytest.mark.long
 def test_so_many_runs_are_open_at_once_and_end_with_the_archive(serve_archive: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr("csas_shadow_ros.archive_page.server.MOST_OPEN", 2)
     server = serve_archive()
