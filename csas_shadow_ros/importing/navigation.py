@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -129,11 +128,13 @@ def _geographic(places: FloatArray, datum: Datum | None, path: Path) -> FloatArr
     rotation, origin = datum.scene_to_earth
     positions = np.empty_like(places)
     for row, (latitude, longitude, altitude) in enumerate(places.tolist()):
-        if not math.isfinite(altitude):
+        try:
+            there = Datum(latitude, longitude, altitude_m=altitude).scene_to_earth[1]
+        except CsasError:  # also NaN, as receivers say what they do not know
             raise ImportSettingsError(
-                f"{path}: pose {row} has no altitude; expected metres over the ellipsoid"
-            )
-        there = Datum(latitude, longitude, altitude_m=altitude).scene_to_earth[1]
+                f"{path}: pose {row} is at latitude {latitude:g}, longitude {longitude:g}, altitude"
+                f" {altitude:g}; expected degrees, and metres over the ellipsoid"
+            ) from None
         positions[row] = rotation.T @ (there - origin)
     return positions
 

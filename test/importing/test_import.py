@@ -296,3 +296,27 @@ def test_the_page_in_the_documents_is_one_and_every_key_is_told_of():
     assert settings.mapping("track", "columns")["down"] == "depth"
     untold = [key for keys in KEYS.values() for key in keys if not re.search(rf"\b{key}\b", text)]
     assert not untold
+
+
+def test_places_that_are_none_and_libraries_that_are_not_there_are_told(run, tmp_path, monkeypatch):
+    source, of_image = npy(run.image, tmp_path)
+    track = tmp_path / "nav.csv"
+    page = write_page(tmp_path, of_image, {"track": {"axes": "geographic"}, "origin": ORIGIN})
+    for cell in ("95.0", "nan"):
+        write_csv(
+            track,
+            ["time", "latitude", "longitude", "altitude"],
+            [["1", "48", "4", "9"], ["2", cell, "4", "9"]],
+        )
+        with pytest.raises(
+            ImportSettingsError, match=f"pose 1 is at latitude {float(cell):g}, longitude 4, altitude 9"
+        ):
+            import_run(source, tmp_path / "bag", page, track=track)
+    track, of_track = csv_scene(run.track, tmp_path)
+    page = write_page(tmp_path, of_image, of_track)
+    (tmp_path / "image.h5").write_bytes(b"x")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(
+        csas.MissingExtraError, match=r"import from HDF5 needs h5py.*csas_shadow_ros\[import\]"
+    ):
+        import_run(tmp_path / "image.h5", tmp_path / "bag", page, track=track)
