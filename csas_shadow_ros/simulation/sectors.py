@@ -69,7 +69,9 @@ def sectors_of_run(image: CoherentImage, track: Track, width_deg: float) -> Iter
         corner = carrier[0] * image.grid.x_min_m + carrier[1] * image.grid.y_max_m
         pixels *= np.complex64(np.exp(-1j * corner))
         at = float(np.mod(aspect, TWO_PI))
-        sector = Sector(pixels, image.grid, image.acoustics, stamp, at, width, carrier, frame=image.frame)
+        sector = Sector(
+            pixels, image.grid, image.acoustics, stamp, at, width, carrier, frame=image.frame
+        )
         yield sector, _passed(track, aspect + turns * width / 2.0, stamp, width)
 
 
