@@ -32,7 +32,7 @@ SOURCES := $(shell find csas_shadow_ros msg_adapters config launch -type f \
 	-not -name '*.pyc' -not -path '*/__pycache__*' 2>/dev/null)
 PACKAGING := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help venv install demo test lint types unit long soak accuracy accuracy-short population bench build clean
+.PHONY: help venv install demo docs test lint types unit long soak accuracy accuracy-short population bench build clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -60,6 +60,19 @@ install: $(VENV)/.installed ## install the package and ROS 2 into it
 demo: install ## replay the demonstration bag
 	@mkdir -p $(ROS_LOG_DIR)
 	$(VENV)/bin/csas-shadow replay $(DEMO_BAG) --out $(DEMO_OUT) --overwrite
+
+$(VENV)/.docs: $(VENV)/.dependencies setup.py
+	$(PY) -m pip install --quiet --disable-pip-version-check --no-build-isolation '.[docs]'
+	touch $@
+
+# Graphs are drawn by mermaid, from npm; without npm the site shows their text.
+build/mermaid/mermaid.js:
+	mkdir -p $(@D)
+	! command -v npm > /dev/null || (cd $(@D) && npm pack --silent mermaid@11.12.0 > /dev/null \
+		&& tar -xzf mermaid-*.tgz && cp package/dist/mermaid.min.js mermaid.js && rm -r package mermaid-*.tgz)
+
+docs: install $(VENV)/.docs build/mermaid/mermaid.js ## the site, into build/site
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --quiet
 
 test: install lint types unit ## lint, types and all tests
 

@@ -71,6 +71,15 @@ TEST += IMPORT
 TEST += ["geopandas>=0.14.3"]
 # The benchmark compares with the fastest FFT library that can be had: a floor to measure against.
 BENCH = ["pyfftw>=0.14"]
+# The site. MkDocs 2 takes no plugins; equations become MathML when the site is built.
+DOCS = [
+    "mkdocs>=1.6,<2",
+    "mkdocs-material>=9.6,<10",
+    "mkdocstrings[python]>=0.29",
+    "mkdocs-jupyter>=0.25",
+    "latex2mathml>=3.77",
+    "ipykernel>=6.29",
+]
 # setuptools 80 dropped what colcon's --symlink-install calls.
 BUILD = ["colcon-common-extensions>=0.3", "setuptools>=68,<80"]
 
@@ -157,7 +166,8 @@ setup(
         "test": TEST,
         "bench": BENCH,
         "build": BUILD,
-        "dev": TEST + BUILD,
+        "docs": DOCS,
+        "dev": TEST + BUILD + DOCS,
     },
     entry_points={
         "console_scripts": [

@@ -1,10 +1,11 @@
-"""The README's tables are those of the code, and its links lead somewhere.
+"""The generated pages are those of the code, and the documents' links lead somewhere.
 
-Rewrite the tables with ``python test/test_readme.py``.
+Rewrite the pages with ``python test/test_readme.py``.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import sys
 from pathlib import Path
@@ -16,26 +17,45 @@ from msg_adapters.topics import topic_table
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
-TABLES = {"topics": topic_table, "parameters": parameter_table}
+PARAMETER_FILE = ROOT / "config" / "csas_shadow.yaml"
+
+
+def cli_reference() -> str:
+    """Return the page of the command line, by what draws the site."""
+    spec = importlib.util.spec_from_file_location("docs_cli", ROOT / "docs" / "make" / "cli.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.cli_reference()
+
+
+#: What stands between marks of that name, and on which page.
+PARTS = {
+    "topics": ("docs/topics.md", topic_table),
+    "parameters": ("docs/parameters.md", parameter_table),
+    "cli": ("docs/cli.md", cli_reference),
+}
 
 
 def marked(name: str) -> re.Pattern[str]:
     return re.compile(rf"(<!-- {name}:begin -->\n)(.*?)(<!-- {name}:end -->)", re.DOTALL)
 
 
-@pytest.mark.parametrize("name", TABLES)
-def test_the_readme_has_the_table_that_the_code_makes(name: str) -> None:
-    found = marked(name).search(README.read_text(encoding="utf-8"))
-    assert found is not None, f"README.md has no <!-- {name}:begin --> marks"
-    assert found[2].strip() == TABLES[name]().strip(), "run: python test/test_readme.py"
+@pytest.mark.parametrize("name", PARTS)
+def test_the_page_has_what_the_code_makes(name: str) -> None:
+    page, make = PARTS[name]
+    found = marked(name).search((ROOT / page).read_text(encoding="utf-8"))
+    assert found is not None, f"{page} has no <!-- {name}:begin --> marks"
+    assert found[2].strip() == make().strip(), "run: python test/test_readme.py"
 
 
 def test_the_parameter_file_holds_the_defaults_of_the_code() -> None:
-    assert (ROOT / "config" / "csas_shadow.yaml").read_text(encoding="utf-8") == yaml_text()
+    assert PARAMETER_FILE.read_text(encoding="utf-8") == yaml_text()
 
 
 def documents() -> list[Path]:
-    return [README, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+    return [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 @pytest.mark.parametrize("page", documents(), ids=lambda page: page.name)
@@ -45,12 +65,16 @@ def test_every_link_in_the_documents_leads_to_a_file(page: Path) -> None:
     assert not missing, f"{page.name} links to {missing}"
 
 
+def test_the_readme_is_short() -> None:
+    assert len(README.read_text(encoding="utf-8").splitlines()) < 120
+
+
 def rewrite() -> None:
-    text = README.read_text(encoding="utf-8")
-    for name, table in TABLES.items():
-        text = marked(name).sub(lambda m, t=table: m[1] + t() + m[3], text)
-    README.write_text(text, encoding="utf-8")
-    (ROOT / "config" / "csas_shadow.yaml").write_text(yaml_text(), encoding="utf-8")
+    for name, (page, make) in PARTS.items():
+        path = ROOT / page
+        text = marked(name).sub(lambda m, t=make(): m[1] + t + m[3], path.read_text(encoding="utf-8"))
+        path.write_text(text, encoding="utf-8")
+    PARAMETER_FILE.write_text(yaml_text(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import base64
 import doctest
-import importlib.util
 import io
 import math
 import re
@@ -106,17 +105,6 @@ def python_blocks(page):
 
 def test_the_readme_shows_what_the_page_on_python_begins_with():
     assert python_blocks("README.md") == python_blocks("docs/python.md")[:1]
-
-
-def test_what_the_page_on_python_shows_runs(tiny_box_bag, tmp_path, monkeypatch):
-    shutil.copytree(tiny_box_bag.path, tmp_path / "my_run")
-    monkeypatch.chdir(tmp_path)
-    names: dict = {}
-    for block in python_blocks("docs/python.md"):
-        if "to_xarray" in block and importlib.util.find_spec("xarray") is None:
-            continue  # the library is an extra
-        exec(compile(block, "docs/python.md", "exec"), names)
-    assert names["result"].verdict == "object"
 
 
 # -- from what a bag holds to a result --------------------------------------------------------------
