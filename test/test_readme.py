@@ -72,7 +72,9 @@ def test_the_readme_is_short() -> None:
 def rewrite() -> None:
     for name, (page, make) in PARTS.items():
         path = ROOT / page
-        text = marked(name).sub(lambda m, t=make(): m[1] + t + m[3], path.read_text(encoding="utf-8"))
+        before, _, rest = path.read_text(encoding="utf-8").partition(f"<!-- {name}:begin -->\n")
+        after = rest.partition(f"<!-- {name}:end -->")[2]
+        text = f"{before}<!-- {name}:begin -->\n{make()}<!-- {name}:end -->{after}"
         path.write_text(text, encoding="utf-8")
     PARAMETER_FILE.write_text(yaml_text(), encoding="utf-8")
 

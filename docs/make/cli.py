@@ -6,8 +6,6 @@ import argparse
 
 from csas_shadow_ros.cli import build_parser
 
-#: A bar inside of a table.
-BAR = "\\|"
 
 
 def cli_reference() -> str:
@@ -35,26 +33,28 @@ def _command(command: argparse.ArgumentParser) -> list[str]:
         actions = [a for a in group._group_actions if a.dest != "help"]
         if not actions:
             continue
-        title = {"positional arguments": "arguments", "options": "options"}.get(group.title or "", group.title)
-        lines += [f"**{title}**", "", "| | |", "|---|---|"]
-        lines += [f"| {_name(a).replace('|', BAR)} | {_cell(_help(a))} |" for a in actions]
+        title = "arguments" if group.title == "positional arguments" else group.title
+        lines += [f"| {title} | |", "|---|---|"]
+        lines += [f"| {_name(a)} | {_cell(_help(a))} |" for a in actions]
         lines.append("")
     return lines[:-1]
 
 
 def _place(action: argparse.Action) -> str:
     shown = str(action.metavar or action.dest)
-    return f"{shown} [{shown} ...]" if action.nargs in ("+", "*") else f"[{shown}]" if action.nargs == "?" else shown
+    if action.nargs in ("+", "*"):
+        return f"{shown} [{shown} ...]"
+    return f"[{shown}]" if action.nargs == "?" else shown
 
 
 def _name(action: argparse.Action) -> str:
     if not action.option_strings:
-        return f"`{action.metavar or action.dest}`"
+        return _code(str(action.metavar or action.dest))
     if isinstance(action, argparse.BooleanOptionalAction):
-        return " ".join(f"`{flag}`" for flag in action.option_strings)
+        return " ".join(_code(flag) for flag in action.option_strings)
     flags = ", ".join(action.option_strings)
     if action.nargs == 0:
-        return f"`{flags}`"
+        return _code(flags)
     if action.choices is not None:
         value = action.metavar or "{" + ",".join(str(c) for c in action.choices) + "}"
     else:
@@ -63,12 +63,17 @@ def _name(action: argparse.Action) -> str:
         value = " ".join(value)
     elif isinstance(action.nargs, int):
         value = " ".join([str(value)] * action.nargs)
-    return f"`{flags} {value}`"
+    return _code(f"{flags} {value}")
 
 
 def _help(action: argparse.Action) -> str:
     text = (action.help or "").replace("%%", "%")
     return f"{text} (required)" if getattr(action, "required", False) and action.option_strings else text
+
+
+def _code(text: str) -> str:
+    # A bar in backticks ends the cell for one reader of Markdown, and an escaped one shows its slash in another.
+    return f"<code>{text.replace('|', '&#124;')}</code>" if "|" in text else f"`{text}`"
 
 
 def _cell(text: str | None) -> str:

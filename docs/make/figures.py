@@ -49,7 +49,8 @@ def draw_mesh(axes, mesh) -> None:
         return
     light = np.clip(np.asarray(mesh.face_normals) @ [-0.35, -0.55, 0.76], 0.0, 1.0)
     colours = np.clip(np.array([0.36, 0.56, 0.78]) * (0.35 + 0.75 * light)[:, None], 0.0, 1.0)
-    axes.add_collection3d(Poly3DCollection(np.asarray(mesh.triangles), facecolors=colours, edgecolors=colours))
+    solid = Poly3DCollection(np.asarray(mesh.triangles), facecolors=colours, edgecolors=colours)
+    axes.add_collection3d(solid)
 
 
 def solid_axes(made: Figure, where, target, reach: float, top: float, turn_deg: float):
@@ -74,7 +75,8 @@ def circle_frame(view, result, target, reach: float) -> Image.Image:
     flat.add_patch(Circle(target.position_m, 1.05 * radius, fill=False, ec="0.6", lw=3))
     aspect = view.info.aspect_rad
     x, y = target.position_m
-    flat.plot(x + 1.05 * radius * math.cos(aspect), y + 1.05 * radius * math.sin(aspect), "o", c=GREEN, ms=13, mec="k")
+    sonar = (x + 1.05 * radius * math.cos(aspect), y + 1.05 * radius * math.sin(aspect))
+    flat.plot(*sonar, "o", c=GREEN, ms=13, mec="k")
     flat.set(xlim=(x - 1.14 * radius, x + 1.14 * radius), ylim=(y - 1.14 * radius, y + 1.14 * radius))
     flat.set_aspect("equal")
     flat.set_axis_off()
@@ -115,7 +117,8 @@ def draw_circle(run, p) -> None:
     palette = frames[-1].quantize(128)
     flat = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     times = [FRAME_MS] * (len(flat) - 1) + [LAST_MS]
-    flat[0].save(FIGURES / "circle.gif", save_all=True, append_images=flat[1:], duration=times, loop=0, optimize=True)
+    options = {"save_all": True, "append_images": flat[1:], "duration": times, "loop": 0, "optimize": True}
+    flat[0].save(FIGURES / "circle.gif", **options)
     made = figure(11.0, 3.0)
     for index, (number, mesh) in enumerate(steps, start=1):
         axes = solid_axes(made, 140 + index, target, reach, 0.8, -60.0)
@@ -166,7 +169,8 @@ def draw_likelihood() -> None:
         power = (amplitude**2).astype(np.float32)
         right.plot(amplitude, l_out(power, contrast), style, color=RED, label=f"{contrast_db:g} dB")
     left.set(xlabel=r"amplitude $i/\sigma_r$", title="density of an amplitude")
-    right.set(xlabel=r"amplitude $i/\sigma_r$", ylim=(0, 1.02), title="likelihood of lying outside the shadow")
+    right.set(xlabel=r"amplitude $i/\sigma_r$", ylim=(0, 1.02))
+    right.set_title("likelihood of lying outside the shadow")
     left.legend(frameon=False)
     right.legend(frameon=False, title="contrast")
     made.savefig(FIGURES / "likelihood.png", dpi=100)
@@ -175,7 +179,10 @@ def draw_likelihood() -> None:
 def main() -> None:
     draw_geometry()
     draw_likelihood()
-    run = csas.read_run(sys.argv[1]) if len(sys.argv) > 1 else csas.simulate("small", "frame", seed=1, heading_deg=25.0)
+    if len(sys.argv) > 1:
+        run = csas.read_run(sys.argv[1])
+    else:
+        run = csas.simulate("small", "frame", seed=1, heading_deg=25.0)
     draw_circle(run, csas.parameters(step_deg=STEP_DEG, voxel_size_m=0.025))
 
 

@@ -18,9 +18,10 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[2]
 #: Pages of the repository's root, and what they are on the site.
 HOMES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
-#: `make docs` puts it there, from npm.
-MERMAID = ROOT / "build" / "mermaid" / "mermaid.js"
+#: `make docs` puts them there, from npm.
+MERMAID, FONT = (ROOT / "build" / "from_npm" / name for name in ("mermaid.js", "math.woff2"))
 _LINK = re.compile(r"(?<=\]\()([^)#:\s]+)((?:#[^)]*)?)(?=\))")
+_NAMED = re.compile(r"\[(?:docs/)?(\w+\.md)\](?=\()")
 _EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 _FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 #: What a browser shows as it is; source texts get .txt, or it would save them instead.
@@ -28,7 +29,8 @@ _PICTURES = (".png", ".gif", ".svg")
 
 
 def on_config(config: Any) -> Any:
-    """Draw mermaid's graphs where it is at hand; otherwise they stay text."""
+    """Learn the pages' titles; draw mermaid's graphs where it is at hand, otherwise they stay text."""
+    _learn(config.nav)
     if MERMAID.exists():
         config.extra_javascript.append("mermaid.js")
         from pymdownx.superfences import fence_code_format
@@ -40,8 +42,9 @@ def on_config(config: Any) -> Any:
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the root's pages, and every file that a page links to."""
-    if MERMAID.exists():
-        files.append(File.generated(config, "mermaid.js", abs_src_path=str(MERMAID)))
+    for path in (MERMAID, FONT):
+        if path.exists():
+            files.append(File.generated(config, path.name, abs_src_path=str(path)))
     pages = {f"docs/{page.src_uri}": page.content_string for page in files.documentation_pages()}
     for name in ("CONTRIBUTING.md", "CHANGELOG.md"):
         text = pages[name] = (ROOT / name).read_text(encoding="utf-8")
@@ -75,6 +78,19 @@ def on_page_content(content: str, **_: Any) -> str:
     return _EQUATION.sub(equation, content)
 
 
+_TITLES: dict[str, str] = {}
+
+
+def _learn(nav: Any) -> None:
+    """Note the titles of the navigation: a link that is called by a file's name gets the page's on the site."""
+    for one in nav:
+        for title, what in one.items():
+            if isinstance(what, str):
+                _TITLES[what] = title
+            else:
+                _learn(what)
+
+
 def _target(page: str, link: str) -> str:
     """Return the file of the repository that a page's link leads to."""
     return os.path.normpath(PurePosixPath(page).parent / link)
@@ -85,6 +101,8 @@ def _site_name(target: str) -> str:
 
 
 def _on_site(text: str, page: str) -> str:
+    text = _NAMED.sub(lambda found: f"[{_TITLES.get(found[1], found[1])}]", text)
+
     def moved(found: re.Match[str]) -> str:
         target = _target(page, found[1])
         if target in HOMES:

@@ -23,7 +23,7 @@ import numpy as np
 import csas_shadow_ros as csas
 from csas_shadow_ros.core.pipeline import ProcessedView
 
-run = csas.simulate("tiny", "box", seed=5, heading_deg=20.0)
+run = csas.simulate("tiny", "box", seed=5, heading_deg=20.0, progress=False)
 run.image
 
 # %% [markdown]

@@ -30,7 +30,8 @@ sonar = get_profile(
 )
 low, centre, high = sonar.band_rad_m
 print(f"grazing angle {np.degrees(sonar.grazing_rad):.1f}°, {low:.0f} to {high:.0f} rad/m on the ground")
-print(f"resolution in range {2 * np.pi / (high - low):.3f} m, across at 12° {2 * np.pi / centre / np.radians(12):.3f} m")
+across_m = 2 * np.pi / centre / np.radians(12.0)
+print(f"resolution in range {2 * np.pi / (high - low):.3f} m, across {across_m:.3f} m in a view of 12°")
 
 # %% [markdown]
 # A band that does not fit the pixels is refused, with the pixel that it needs:
@@ -45,8 +46,8 @@ except csas.CsasError as error:
 # ## A clean run
 
 # %%
-made = csas.simulate(sonar, "tyre", seed=1)
-p = csas.parameters(step_deg=10, voxel_size_m=0.03)
+made = csas.simulate(sonar, "tyre", seed=1, progress=False)
+p = csas.parameters(step_deg=15, voxel_size_m=0.03)
 result = csas.reconstruct(made, p, progress=False)
 result
 
@@ -57,7 +58,8 @@ result
 
 # %%
 faults = csas.Faults(contrast_db=8.0, track_wobble_m=0.2)
-worse = csas.reconstruct(csas.simulate(sonar, "tyre", seed=1, faults=faults), p, progress=False)
+rough = csas.simulate(sonar, "tyre", seed=1, faults=faults, progress=False)
+worse = csas.reconstruct(rough, p, progress=False)
 print(worse)
 
 # %% [markdown]
@@ -66,22 +68,19 @@ print(worse)
 # The image must hold the target and its whole shadow. A cylinder 1.8 m long on an image of 2.56 m does not fit, and the search finds nothing:
 
 # %%
-print(csas.reconstruct(csas.simulate(sonar, "cylinder", seed=1), p, progress=False))
+large = csas.simulate(sonar, "cylinder", seed=1, progress=False)
+print(csas.reconstruct(large, p, progress=False))
 
 # %% [markdown]
 # ## Which method?
 #
-# `consensus` is the default; `hard` and `soft` are the paper's.
+# `consensus` is the default. Each result also holds the grid that the other kind of carving leaves, here the paper's `soft`.
 
 # %%
-volumes = {}
-for method in ("consensus", "hard", "soft"):
-    chosen = csas.parameters(step_deg=10, voxel_size_m=0.03, method=method)
-    volumes[method] = csas.reconstruct(made, chosen, progress=False).grid.occupied.sum() * 0.03**3
-true = made.truth.target.volume
+volumes = {grid.method: grid.occupied.sum() * grid.volume.voxel_size_m**3 for grid in (result.grid, result.other_grid)}
 figure, axes = plt.subplots(figsize=(6, 3))
 axes.bar(list(volumes), list(volumes.values()))
-axes.axhline(true, color="k", ls="--", label="true")
+axes.axhline(made.truth.target.volume, color="k", ls="--", label="true")
 axes.set(ylabel="volume (m³)")
 axes.legend();
 

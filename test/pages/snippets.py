@@ -6,8 +6,8 @@ A block runs unless a comment before it says why not::
     <!-- long -->                             only by `make long`
     <!-- before: cp -r my_run other_run -->   first run this, which the reader has done already
 
-A ``console`` block is a line of shell each, or, where lines begin with ``$``, those lines alone. A ``python`` block goes on
-where the one before it ended.
+A ``console`` block is a line of shell each, or, where lines begin with ``$``, those lines alone. A ``python``
+block goes on where the one before it ended.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ def blocks_of(path: Path) -> list[Block]:
 
 def is_ours(command: str) -> bool:
     """Whether a line is one call of csas-shadow, without the shell's doing."""
-    return command.startswith("csas-shadow ") and not re.search(r"[|&;<>$*]", re.sub(r"'[^']*'|\"[^\"]*\"", "", command))
+    bare = re.sub(r"'[^']*'|\"[^\"]*\"", "", command).partition("#")[0]
+    return command.startswith("csas-shadow ") and not re.search(r"[|&;<>$*]", bare)
 
 
 def arguments_of(command: str) -> list[str]:
@@ -124,7 +125,8 @@ class Reader:
         assert code == 0, f"{block.page}:{block.line}: csas-shadow {shlex.join(arguments)}\n{said.getvalue()}"
 
     def _shell(self, block: Block, command: str) -> None:
+        words = ["bash", "-c", command]
         done = subprocess.run(
-            ["bash", "-c", command], cwd=self.folder, env=self.environment, capture_output=True, text=True, timeout=300
+            words, cwd=self.folder, env=self.environment, capture_output=True, text=True, timeout=300
         )
         assert done.returncode == 0, f"{block.page}:{block.line}: {command}\n{done.stdout}{done.stderr}"

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+import runpy
 import shutil
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
 from snippets import CHEAPER, ROOT, RUN_KINDS, SHOWN_KINDS, Block, Reader, arguments_of, blocks_of, is_ours
 
@@ -61,6 +63,20 @@ def test_what_is_not_run_says_why() -> None:
     assert not without
 
 
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.py"))
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.name)
+def test_a_notebook_runs(notebook: Path, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            runpy.run_path(str(notebook), run_name="__notebook__")
+    finally:
+        plt.close("all")
+
+
 def options_of_blocks_not_run() -> list:
     return [
         pytest.param(arguments_of(command), id=f"{block.page}:{block.line} {command[:40]}")
@@ -83,11 +99,8 @@ def test_a_command_that_is_not_run_is_at_least_one(arguments: list[str]) -> None
 
 def test_every_target_of_make_that_a_page_names_is_there() -> None:
     there = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    named = {
-        target
-        for page in PAGES
-        for target in re.findall(r"(?:`|^)make ([a-z][a-z-]*)", page.read_text(encoding="utf-8"), re.MULTILINE)
-    }
+    pattern = re.compile(r"(?:`|^)make ([a-z][a-z-]*)", re.MULTILINE)
+    named = {target for page in PAGES for target in pattern.findall(page.read_text(encoding="utf-8"))}
     assert named
     assert named <= there
 
