@@ -12,6 +12,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 
 import csas_shadow_ros
 
@@ -44,6 +45,13 @@ def wheel(tmp_path_factory):
     assert done.returncode == 0, done.stderr
     (path,) = out.glob("*.whl")
     return zipfile.ZipFile(path)
+
+
+def test_the_changelog_and_the_citation_are_of_this_version():
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(r"^## (\S+)", changelog, re.MULTILINE)[1] == csas_shadow_ros.__version__
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == csas_shadow_ros.__version__
 
 
 def test_package_xml_and_the_package_agree_on_name_version_and_licence():

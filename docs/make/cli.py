@@ -7,7 +7,6 @@ import argparse
 from csas_shadow_ros.cli import build_parser
 
 
-
 def cli_reference() -> str:
     """Return every command of ``csas-shadow`` with its options, as Markdown."""
     parser = build_parser()
@@ -72,7 +71,7 @@ def _help(action: argparse.Action) -> str:
 
 
 def _code(text: str) -> str:
-    # A bar in backticks ends the cell for one reader of Markdown, and an escaped one shows its slash in another.
+    # A bar in backticks ends the cell for some readers of Markdown, an escaped one shows its slash in others.
     return f"<code>{text.replace('|', '&#124;')}</code>" if "|" in text else f"`{text}`"
 
 

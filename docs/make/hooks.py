@@ -82,7 +82,7 @@ _TITLES: dict[str, str] = {}
 
 
 def _learn(nav: Any) -> None:
-    """Note the titles of the navigation: a link that is called by a file's name gets the page's on the site."""
+    """Note the titles of the navigation, for links that are called by a file's name."""
     for one in nav:
         for title, what in one.items():
             if isinstance(what, str):

@@ -54,16 +54,6 @@ def test_the_yaml_file_reads_back_to_the_defaults() -> None:
         assert kind.from_mapping(section["ros__parameters"]) == kind()
 
 
-def test_the_readme_holds_the_table_of_the_dataclasses() -> None:
-    readme = ROOT / "README.md"
-    text = readme.read_text(encoding="utf-8") if readme.exists() else ""
-    begin, end = "<!-- parameters:begin -->", "<!-- parameters:end -->"
-    if begin not in text:
-        pytest.skip("README.md has no parameter table")
-    table = text.split(begin, 1)[1].split(end, 1)[0]
-    assert table.strip() == params.parameter_table().strip(), "run: python -m csas_shadow_ros.nodes.params"
-
-
 def test_the_table_names_every_parameter_of_every_node_with_its_default() -> None:
     table = params.parameter_table()
     for name, kind in params.NODES.items():
