@@ -23,6 +23,7 @@ MERMAID, FONT = (ROOT / "build" / "from_npm" / name for name in ("mermaid.js", "
 _LINK = re.compile(r"(?<=\]\()([^)#:\s]+)((?:#[^)]*)?)(?=\))")
 _NAMED = re.compile(r"\[(?:docs/)?(\w+\.md)\](?=\()")
 _EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
+_LOADER = re.compile(r"<script[^>]*>(?:(?!</script>).)*cdnjs(?:(?!</script>).)*</script>", re.DOTALL)
 _FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 #: What a browser shows as it is; source texts get .txt, or it would save them instead.
 _PICTURES = (".png", ".gif", ".svg")
@@ -66,6 +67,11 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     if page.file.src_uri in HOMES.values() and page.file.src_uri != "index.md":
         return markdown  # done in on_files
     return _on_site(markdown, f"docs/{page.file.src_uri}")
+
+
+def on_post_page(output: str, **_: Any) -> str:
+    """Leave out the notebooks' loader of mermaid, which would ask a CDN."""
+    return _LOADER.sub("", output)
 
 
 def on_page_content(content: str, **_: Any) -> str:
