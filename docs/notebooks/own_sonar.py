@@ -47,7 +47,7 @@ except csas.CsasError as error:
 
 # %%
 made = csas.simulate(sonar, "tyre", seed=1, progress=False)
-p = csas.parameters(step_deg=15, voxel_size_m=0.03)
+p = csas.parameters(step_deg=10, voxel_size_m=0.03)
 result = csas.reconstruct(made, p, progress=False)
 result
 
