@@ -25,7 +25,7 @@ from ..durable import BY_HAND, CHECKSUMS, Place, write_checksums
 from .bag import ResultBag
 from .report import FORMAT, Context, build_report, complete_report, report_text, summary
 from .subject import Keeper, Subject
-from .truth import placed, score
+from .truth import KnownTruth, of_nothing, of_objects, placed, score
 
 if TYPE_CHECKING:
     import trimesh
@@ -217,7 +217,12 @@ class ResultsWriter:
             voxel = context.parameters.carving.voxel_size_m
             known = truth
             truth = context.truth = self.attempt("truth", lambda: placed(known, extent, voxel), known)
-        scored = truth is not None and truth.has_object and result.grid is not None and bool(result.evidence)
+        own: list[KnownTruth | None] = []
+        if truth is not None:
+            scene = truth
+            own = self.attempt("truth", lambda: _own_truths(scene, result, context), own)
+        mine = own[0] if own else None
+        scored = mine is not None and mine.has_object and result.grid is not None and bool(result.evidence)
         to_come = (["figures"] if self._figures else []) + (["scores"] if scored else [])
         try:
             write_grid(self._work / GRID, result.grid or _unknown_grid(result, context), result.matter)
@@ -230,6 +235,7 @@ class ResultsWriter:
                 result,
                 context,
                 other=other,
+                truths=own,
                 figures_left_out={} if self._figures else {"all": "not asked for"},
                 attempt=self.attempt,
             )
@@ -237,7 +243,7 @@ class ResultsWriter:
         except OSError as error:
             raise ResultsError(f"cannot write {self.folder}: {error}") from error
         if to_come:
-            self._add_what_may_fail(report, sums, result, context, scored=scored)
+            self._add_what_may_fail(report, sums, result, context, mine, scored=scored)
         return report
 
     def _write_surfaces(self, result: Result) -> None:
@@ -265,7 +271,14 @@ class ResultsWriter:
                 path.unlink(missing_ok=True)
 
     def _add_what_may_fail(
-        self, report: dict[str, Any], sums: dict[str, str], result: Result, context: Context, *, scored: bool
+        self,
+        report: dict[str, Any],
+        sums: dict[str, str],
+        result: Result,
+        context: Context,
+        truth: KnownTruth | None,
+        *,
+        scored: bool,
     ) -> None:
         """Draw figures and score, then put the folder in place again; it is there whatever happens here."""
         timings = context.timings_s
@@ -276,11 +289,10 @@ class ResultsWriter:
             report["failed"] = dict(self.failed)
             return
         left_out: dict[str, str] = {} if self._figures else {"all": "not asked for"}
-        truth = context.truth
         if self._figures:
             began = time.perf_counter()
             left_out = self.attempt(
-                "figures", lambda: self._draw(result, context, work), {"all": "see failed"}
+                "figures", lambda: self._draw(result, context, truth, work), {"all": "see failed"}
             )
             timings["figures"] = time.perf_counter() - began
         scores = None
@@ -297,10 +309,11 @@ class ResultsWriter:
             self.failed["figures and scores"] = f"cannot be put in place: {error}"
             report["failed"] = dict(self.failed)
 
-    def _draw(self, result: Result, context: Context, work: Path) -> dict[str, str]:
+    def _draw(
+        self, result: Result, context: Context, truth: KnownTruth | None, work: Path
+    ) -> dict[str, str]:
         from .figures import draw_all  # late: what only looks at a folder needs no matplotlib
 
-        truth = context.truth
         subject = Subject(
             result,
             self._keeper,
@@ -340,6 +353,13 @@ def _extent(result: Result, context: Context) -> tuple[float, float, float, floa
         return None
     (x, y, _), (length, width, _) = result.grid.volume.centre_m, result.grid.volume.size_m
     return x - length, x + length, y - width, y + width
+
+
+def _own_truths(truth: KnownTruth, result: Result, context: Context) -> list[KnownTruth | None]:
+    """Return what the target is in truth, then each further object."""
+    voxel, found = context.parameters.carving.voxel_size_m, [one.dimensions for one in result.objects]
+    own = of_objects(truth, found, voxel)
+    return own if result.mesh is not None else [of_nothing(truth, voxel), *own]
 
 
 def _measured(grid: VoxelGrid | None) -> Dimensions | None:

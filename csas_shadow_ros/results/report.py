@@ -169,8 +169,11 @@ def _hollows(result: Result, scores: Mapping[str, float] | None) -> dict[str, An
     }
 
 
-def _objects(result: Result) -> list[dict[str, Any]]:
+def _objects(result: Result, truths: Sequence[KnownTruth | None]) -> list[dict[str, Any]]:
     """Return one entry an object, the target first."""
+    # Where there is no target its truth stands there all the same.
+    own = list(truths) if result.mesh is not None else list(truths[1:])
+    own += [None] * (len(result.objects) - len(own))
     entries = []
     for number, one in enumerate(result.objects, start=1):
         # The first object is the target, unless its carving left none.
@@ -180,6 +183,7 @@ def _objects(result: Result) -> list[dict[str, Any]]:
                 "number": number,
                 "position_m": one.dimensions.position_m,
                 "dimensions": _dimensions(one.dimensions),
+                "truth": None if (known := own[number - 1]) is None else _dimensions(known.dimensions),
                 "place": result.place_of(one.dimensions),
                 "target": one.target,
                 "grid": _grid(one.grid),
@@ -298,6 +302,7 @@ def build_report(
     context: Context,
     *,
     other: Dimensions | None,
+    truths: Sequence[KnownTruth | None],
     figures_left_out: Mapping[str, str],
     attempt: Callable[[str, Callable[[], Any], Any], Any],
 ) -> dict[str, Any]:
@@ -309,6 +314,8 @@ def build_report(
         What was found, and of what.
     other : Dimensions, optional
         Measures by the other method.
+    truths : sequence of KnownTruth or None
+        What the target is in truth, and each further object after it (`truth.of_objects`).
     figures_left_out : mapping
         Why figures are not there.
     attempt : callable
@@ -338,7 +345,7 @@ def build_report(
         "arc_deg": math.degrees(result.arc_rad),
         "frame": result.frame,
         "datum": result.datum,
-        "objects": part("objects", lambda: _objects(result), []),
+        "objects": part("objects", lambda: _objects(result, truths), []),
         "objects_left_out": result.left_out,
         "method": context.parameters.carving.method,
         "dimensions": part("dimensions", lambda: _dimensions(result.dimensions)),
@@ -354,7 +361,7 @@ def build_report(
             lambda: {"grid": _grid(result.other_grid), "dimensions": _dimensions(other)},
             {"grid": None, "dimensions": None},
         ),
-        "truth": part("truth", lambda: _truth(context.truth)),
+        "truth": part("truth", lambda: _truth(context.truth, truths)),
         "views": {
             "in": max(used + lost, composed) if context.views_in is None else context.views_in,
             "used": used,
@@ -383,17 +390,21 @@ def build_report(
     return ready
 
 
-def _truth(truth: KnownTruth | None) -> dict[str, Any] | None:
+def _truth(truth: KnownTruth | None, truths: Sequence[KnownTruth | None]) -> dict[str, Any] | None:
     if truth is None:
         return None
+    mine = truths[0] if truths else None
+    notes = list(truth.notes)
+    if mine is None:
+        notes.append("it is of several bodies, and none of them alone is the object: nothing is compared")
     return {
         "mesh": str(truth.path),
         "object": truth.has_object,
-        "dimensions": _dimensions(truth.dimensions),
+        "dimensions": None if mine is None else _dimensions(mine.dimensions),
         "scores": None,
         "record": truth.record,
         "problem": truth.problem or None,
-        "notes": list(truth.notes),
+        "notes": notes,
     }
 
 
@@ -448,6 +459,10 @@ def headline(report: Mapping[str, Any]) -> str:
     if report.get("why_no_object") and report["verdict"] == "no object":
         text += f": {report['why_no_object']}"
     return text if quality["verdict"] == "good" else f"{text} ({quality['verdict']})"
+
+
+def _sides(d: Mapping[str, Any]) -> str:
+    return f"{d['length_m']:.3f} x {d['width_m']:.3f} x {d['height_m']:.3f} m"
 
 
 def summary(report: Mapping[str, Any]) -> str:
@@ -532,9 +547,10 @@ def summary(report: Mapping[str, Any]) -> str:
         d = entry["dimensions"]
         x, y = d["position_m"]
         lines.append(
-            f"object {entry['number']}: {d['length_m']:.3f} x {d['width_m']:.3f} x {d['height_m']:.3f} m,"
-            f" {d['volume_m3']:.4f} m³, heading {d['heading_deg']:.1f}°, at ({x + 0.0:.2f}, {y + 0.0:.2f}) m,"
+            f"object {entry['number']}: {_sides(d)}, {d['volume_m3']:.4f} m³,"
+            f" heading {d['heading_deg']:.1f}°, at ({x + 0.0:.2f}, {y + 0.0:.2f}) m,"
             f" {entry['views_used']} views"
+            + ("" if (t := entry.get("truth")) is None else f"; in truth {_sides(t)}")
         )
     for left in report.get("objects_left_out", []):
         x, y = left["position_m"]

@@ -5,16 +5,20 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from ..core.errors import CsasError
 from ..core.mesh import Dimensions, measure
-from ..core.solid import judge_solid
+from ..core.solid import judge_solid, open_edges
 from ..core.volume import Volume, VoxelGrid
 
 if TYPE_CHECKING:
@@ -30,6 +34,9 @@ _MOST_VOXELS = 1 << 25
 #: A truth so many times as long as the scene is in other units: a target that fills a quarter of the scene is
 #: 10 times as long as it in inches taken for metres, 25 in centimetres, 250 in millimetres.
 _OTHER_UNITS = 8.0
+#: An object is a body where so much of the smaller one's plan lies in the other's: not so what stands beside
+#: it, and a neighbour that its plan's rectangle cuts.
+_SAME_PLAN = 0.5
 
 
 class TruthError(CsasError):
@@ -183,6 +190,135 @@ def placed(truth: KnownTruth, extent_m: tuple[float, float, float, float], voxel
     if not why:
         return truth
     return dataclasses.replace(truth, unusable=f"truth {truth.path} {why}")
+
+
+def of_objects(
+    truth: KnownTruth, found: Sequence[Dimensions], voxel_size_m: float
+) -> list[KnownTruth | None]:
+    """Say what each object is in truth: of a scene of several bodies, its own ones alone.
+
+    Bodies whose plans touch, or are within a voxel, are one thing. A thing belongs to the object that shares
+    most of its plan with it; an object that covers two is both. Of a single thing the truth is the target's,
+    wherever that was found.
+
+    Parameters
+    ----------
+    truth : KnownTruth
+        Of the scene.
+    found : sequence of Dimensions
+        The objects, the target first.
+    voxel_size_m : float
+        Edge of a voxel of the reconstruction.
+
+    Returns
+    -------
+    list of KnownTruth or None
+        One an object; None where it is none of the bodies, or they cannot be told apart: several that touch,
+        found as several objects.
+
+    Examples
+    --------
+    >>> import trimesh
+    >>> from csas_shadow_ros.core.mesh import measure
+    >>> boxes = [trimesh.creation.box((0.8, 0.4, 0.4)), trimesh.creation.box((0.5, 0.4, 0.4))]
+    >>> _ = boxes[1].apply_translation((1.5, 0.0, 0.0))
+    >>> scene = KnownTruth(Path("bag.truth.stl"), trimesh.util.concatenate(boxes))
+    >>> own = of_objects(scene, [measure(boxes[1]), measure(boxes[0])], 0.02)
+    >>> [round(one.dimensions.length_m, 3) for one in own]
+    [0.5, 0.8]
+    """
+    if not found:
+        return []
+    alone: list[KnownTruth | None] = [truth, *[None] * (len(found) - 1)]
+    if not truth.has_object or truth.unusable:
+        return alone
+    things = _things(truth.mesh, voxel_size_m)
+    if len(things) == 1 and len(found) == 1:
+        return alone
+    rectangles = [_rectangle(d) for d in found]
+    own: list[list[_Thing]] = [[] for _ in found]
+    for thing in things:
+        shared = np.array([_shared(thing.plan, rectangle) for rectangle in rectangles])
+        claimed = int(np.count_nonzero(shared >= _SAME_PLAN))
+        if claimed == 1 or (claimed and thing.bodies == 1):
+            own[int(shared.argmax())].append(thing)
+    if len(things) == 1:
+        if any(own):
+            return [truth if mine else None for mine in own]
+        return alone if things[0].bodies == 1 else [None] * len(found)
+    return [_part(truth, mine) if mine else None for mine in own]
+
+
+def of_nothing(truth: KnownTruth, voxel_size_m: float) -> KnownTruth | None:
+    """Return the truth where no object was found: None where it is several, of which none is to be named."""
+    several = truth.has_object and not truth.unusable and len(_things(truth.mesh, voxel_size_m)) > 1
+    return None if several else truth
+
+
+@dataclass(frozen=True, eq=False)
+class _Thing:
+    """Bodies that are one thing: their faces, how many they are, and the hull of their plan."""
+
+    faces: NDArray[np.bool_]
+    bodies: int
+    plan: NDArray[np.float32]
+
+
+def _things(mesh: trimesh.Trimesh, gap_m: float) -> list[_Thing]:
+    faces, corners = np.asarray(mesh.faces), np.asarray(mesh.vertices)[:, :2]
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    edges = coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(len(corners),) * 2)
+    body_of = connected_components(edges, directed=False)[1][faces[:, 0]]
+    bodies = [np.flatnonzero(body_of == body) for body in np.unique(body_of)]
+    # Grown by half of the gap, plans that are nearer than it overlap.
+    grown = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * gap_m / 2
+    plans = [_hull((corners[np.unique(faces[body])][:, None] + grown).reshape(-1, 2)) for body in bodies]
+    low, high = (np.array([edge(plan, axis=0) for plan in plans]) for edge in (np.min, np.max))
+    near = (low[:, None] <= high[None]).all(axis=2)
+    pairs = [
+        (one, other)
+        for one, other in np.argwhere(np.triu(near & near.T, 1))
+        if cv2.intersectConvexConvex(plans[one], plans[other])[0] > 0
+    ]
+    together = np.array(pairs, int).reshape(-1, 2)
+    links = coo_matrix((np.ones(len(together), bool), tuple(together.T)), shape=(len(bodies),) * 2)
+    thing_of = connected_components(links, directed=False)[1]
+    things = []
+    for thing in np.unique(thing_of):
+        members = np.flatnonzero(thing_of == thing)
+        mine = np.isin(body_of, np.unique(body_of)[members])
+        things.append(_Thing(mine, len(members), _hull(np.concatenate([plans[i] for i in members]))))
+    return things
+
+
+def _hull(points: NDArray[Any]) -> NDArray[np.float32]:
+    return np.asarray(cv2.convexHull(points.astype(np.float32))[:, 0], np.float32)
+
+
+def _rectangle(d: Dimensions) -> NDArray[np.float32]:
+    along = np.array([math.cos(d.heading_rad), math.sin(d.heading_rad)]) * d.length_m / 2
+    across = np.array([-math.sin(d.heading_rad), math.cos(d.heading_rad)]) * d.width_m / 2
+    corners = (along + across, along - across, -along - across, across - along)
+    return _hull(np.asarray(d.position_m) + np.array(corners))
+
+
+def _shared(plan: NDArray[np.float32], rectangle: NDArray[np.float32]) -> float:
+    """Return the share of the smaller one's area that lies in the other."""
+    area = min(cv2.contourArea(plan), cv2.contourArea(rectangle))
+    return float(cv2.intersectConvexConvex(plan, rectangle)[0]) / area if area > 0 else 0.0
+
+
+def _part(truth: KnownTruth, things: Sequence[_Thing]) -> KnownTruth:
+    import trimesh
+
+    from ..simulation.hull import enclosed_volume  # late: few bags have a truth
+
+    faces = np.asarray(truth.mesh.faces)[np.any([thing.faces for thing in things], axis=0)]
+    mesh = trimesh.Trimesh(truth.mesh.vertices, faces, process=False)
+    mesh.remove_unreferenced_vertices()
+    left = open_edges(mesh.faces)
+    volume = math.nan if left else enclosed_volume(mesh)
+    return dataclasses.replace(truth, mesh=mesh, open_edges=left, volume_m3=volume)
 
 
 def score(

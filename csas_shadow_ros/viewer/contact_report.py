@@ -170,7 +170,7 @@ def sheet_of(store: ViewStore, contact: str = "") -> Sheet:
             judged += f"; {who}: {other['value']['verdict']}"
     target = one.get("volume") == "main"
     dimensions = (scene["dimensions"] if target else None) or one.get("dimensions") or {}
-    truth = scene["truth"] if target else None
+    truth = scene["truth"] if target else one.get("truth")
     rows = []
     for label, key, unit, digits in _ROWS:
         if dimensions.get(key) is not None:

@@ -55,6 +55,7 @@ def contacts_of(report: Mapping[str, Any]) -> list[dict[str, Any]]:
                 "size_m": max(d["length_m"], d["width_m"], 2.0 * d["height_m"]),
                 "height_m": d["height_m"],
                 "dimensions": d,
+                "truth": entry.get("truth"),
                 "views_used": entry.get("views_used"),
                 "volume": "main" if files[0] == "grid.npz" else f"object_{number}",
             }

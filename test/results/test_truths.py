@@ -13,11 +13,11 @@ import pytest
 import trimesh
 
 from csas_shadow_ros.core.errors import CsasError, GeometryError
-from csas_shadow_ros.core.mesh import mesh_from_grid
+from csas_shadow_ros.core.mesh import measure, mesh_from_grid
 from csas_shadow_ros.core.solid import apart, judge_solid, open_edges
 from csas_shadow_ros.core.volume import Volume, VoxelGrid
 from csas_shadow_ros.results import TruthError, read_truth, score
-from csas_shadow_ros.results.truth import placed
+from csas_shadow_ros.results.truth import of_nothing, of_objects, placed
 from csas_shadow_ros.simulation import get_profile, make_scene, simulate
 from csas_shadow_ros.simulation.hull import enclosed_volume, shadow_hull, voxelise_truth
 
@@ -278,6 +278,65 @@ def test_a_target_in_millimetres_is_refused_before_the_memory_is_taken(tmp_path)
     told, used = done.stdout.splitlines()
     assert "expected at most 2e+06: a mesh in metres" in told
     assert int(used.split()[0]) < 1000
+
+
+# -- which body is which object --------------------------------------------------------------------------
+
+#: Two boxes a metre apart, turned: the whole scene measures 1.9 m.
+SMALL, LARGE = a_box((0.5, 0.3, 0.3), (0.9, 0.7, 0.15)), a_box((0.8, 0.4, 0.4), (-0.5, -0.4, 0.2))
+
+
+def lengths(truth, *found) -> list[float | None]:
+    own = of_objects(truth, [measure(body) for body in found], VOXEL)
+    return [None if one is None else round(one.dimensions.length_m, 3) for one in own]
+
+
+def moved(mesh: trimesh.Trimesh, x: float, y: float = 0.0) -> trimesh.Trimesh:
+    out = mesh.copy()
+    out.apply_translation((x, y, 0.0))
+    return out
+
+
+def test_each_object_has_the_truth_of_its_own_body(tmp_path):
+    truth = truth_beside(tmp_path, joined(SMALL, LARGE))
+    assert lengths(truth, moved(LARGE, 0.05), SMALL) == [0.8, 0.5]
+    assert lengths(truth, SMALL) == [0.5]
+    assert of_objects(truth, [measure(SMALL)], VOXEL)[0].dimensions.volume_m3 == pytest.approx(0.045)
+    assert lengths(truth, moved(SMALL, 0.0, -1.5)) == [None], "nothing stands there"
+    assert lengths(truth, trimesh.creation.box((2.6, 2.6, 0.4))) == [
+        round(measure(joined(SMALL, LARGE)).length_m, 3)
+    ]
+
+
+def test_a_score_is_of_the_body_that_the_object_is(tmp_path):
+    truth = truth_beside(tmp_path, joined(SMALL, LARGE))
+    (mine,) = of_objects(truth, [measure(LARGE)], VOXEL)
+    assert score(mine, carved(LARGE), SONAR)["iou_truth"] == 1.0
+    assert score(truth, carved(LARGE), SONAR)["iou_truth"] < 0.8
+
+
+def test_bodies_that_cannot_be_told_apart_are_compared_as_one_or_not_at_all(tmp_path):
+    halves = a_box((0.4, 0.4, 0.4), (-0.21, 0, 0.2)), a_box((0.4, 0.4, 0.4), (0.21, 0, 0.2))
+    truth = truth_beside(tmp_path, joined(*halves))  # 2 cm apart, half of a voxel
+    assert lengths(truth, a_box((0.82, 0.4, 0.4))) == [0.82]
+    assert lengths(truth, *halves) == [None, None]
+
+
+def test_of_one_body_the_truth_is_the_targets_wherever_it_was_found(tmp_path):
+    truth = truth_beside(tmp_path, BOX)
+    far = moved(BOX, 3.0)
+    assert lengths(truth, far) == lengths(truth, BOX) == [0.8]
+    assert lengths(truth, far, BOX) == [None, 0.8]
+    assert lengths(truth, far, moved(far, 3.0)) == [0.8, None]
+    left, right = a_box((0.35, 0.4, 0.4), (-0.2, 0, 0.2)), a_box((0.3, 0.4, 0.4), (0.25, 0, 0.2))
+    assert lengths(truth, right, left) == [None, 0.8], "of one that broke in two it is the larger part's"
+
+
+def test_where_nothing_was_found_no_body_of_several_stands_for_the_scene(tmp_path):
+    truth = truth_beside(tmp_path, joined(SMALL, LARGE))
+    assert of_nothing(truth, VOXEL) is None
+    truth = truth_beside(tmp_path, BOX)
+    assert of_nothing(truth, VOXEL) is truth
 
 
 # -- solids ---------------------------------------------------------------------------------------------

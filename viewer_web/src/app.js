@@ -624,7 +624,7 @@ class App {
     const c = this.contact, target = !c || c.volume === "main";
     const d = target ? this.scene.dimensions ?? c?.dimensions : c.dimensions;
     // Beside a second run there is room for nothing else.
-    const o = (target && this.scene.other?.dimensions) || null, t = target && !o ? this.scene.truth : null, m = target && !o ? this.surfaceMeasures : null, table = $("dimensions");
+    const o = (target && this.scene.other?.dimensions) || null, t = o ? null : target ? this.scene.truth : c.truth, m = target && !o ? this.surfaceMeasures : null, table = $("dimensions");
     table.replaceChildren();
     const row = (cells, head) => {
       const tr = table.insertRow();
