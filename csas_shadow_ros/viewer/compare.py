@@ -39,6 +39,7 @@ class Second:
         self.store, self.own = store, ViewStore()
         self.source = PathSource(self.own, path, namespace)
         self.done = threading.Event()
+        self._passed: dict[str, str] = {}
         self.own.listeners.append(self._pass_on)
         self._part()
 
@@ -59,9 +60,14 @@ class Second:
             self.store.put_view(SECOND + notice["set"], self.own.entry(notice["set"], stamp))
         elif notice["type"] == "part" and notice["part"] in ("dimensions", "contacts", "damage"):
             self._part()
-        elif notice["type"] == "part" and notice["part"] == "volumes" and "main" in notice["value"]:
+        elif notice["type"] == "part" and notice["part"] == "volumes":
             fraction = self.source.parameters.carving.min_views_fraction
-            self.store.put_grid("b", self.own.grids["main"], fraction)
+            for name, about in notice["value"].items():
+                if name != "other" and self._passed.get(name) != about["rev"]:
+                    self._passed[name] = about["rev"]
+                    self.store.put_grid(
+                        "b" if name == "main" else f"b_{name}", self.own.grids[name], fraction
+                    )
 
     def _part(self) -> None:
         scene, first = self.own.scene(), self.store.scene()
@@ -77,6 +83,15 @@ class Second:
             {
                 "title": scene["title"],
                 "dimensions": scene["dimensions"],
+                "contacts": [
+                    {
+                        "name": c["name"],
+                        "position_m": [a + b for a, b in zip(c["position_m"], offset, strict=True)],
+                        "dimensions": c["dimensions"],
+                    }
+                    for c in scene["contacts"]
+                    if c["kind"] == "object"
+                ],
                 "damage": scene["damage"],
                 "offset_m": offset,
                 "moved_m": math.hypot(*offset),

@@ -22,6 +22,7 @@ from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from .. import __version__
@@ -40,14 +41,22 @@ _DPI = 170
 _PICTURE_PX = 560
 _COLOURS = {"mine-like": "#b3261e", "not mine-like": "#1d7a3c", "undecided": "#9a5b00", "": "#555555"}
 _QUALITY = {"good": "#1d7a3c", "limited": "#9a5b00", "not trustworthy": "#b3261e"}
+#: Behind what is written over a picture.
+_BOX = {"facecolor": "black", "alpha": 0.65, "pad": 1.5, "edgecolor": "none"}
+#: Side of the picture in colour, in sizes of the contact: it and what stands beside it.
+_ROUND = 3.0
 #: Lines of text that the page has room for; more are counted.
-_REMARK_LINES, _DAMAGE_LINES = 5, 6
+_REMARK_LINES, _DAMAGE_LINES = 7, 4
 _ROWS = (
     ("Length", "length_m", "m", 2),
     ("Width", "width_m", "m", 2),
     ("Height", "height_m", "m", 2),
     ("Volume", "volume_m3", "m³", 3),
     ("Heading", "heading_rad", "°", 1),
+)
+_LEGEND = (
+    f"Amber: segmented shadow. Blue: shadow that the shape casts. Grey: {_LOW:g} to +{_HIGH:g} dB over the"
+    " view's median. Hue: from which side it is bright. White: nothing was imaged there."
 )
 Draw = Callable[[Any], None]
 
@@ -136,7 +145,7 @@ def _facts(scene: Mapping[str, Any], contact: Mapping[str, Any]) -> list[str]:
     objects = sum(c["kind"] == "object" for c in others)
     if others:
         strong = sum(bool(c.get("strong")) for c in others)
-        text = f"Also in this run: {objects} further contact{'s' if objects != 1 else ''}"
+        text = f"Also in this run: {objects or 'no'} further contact{'s' if objects != 1 else ''}"
         left = len(others) - objects
         lines.append(f"{text}, {left} left out{f', {strong} of them may be an object' if strong else ''}.")
     return lines
@@ -250,7 +259,7 @@ def _add_pictures(
         )
     if "color_by_aspect" in store.pictures:
         sheet.pictures.append(
-            ("Colour by aspect, north up", lambda axes: _draw_colours(axes, store, contact, found))
+            ("Colour by aspect, north up", lambda axes: _draw_colours(axes, store, contact))
         )
     if mesh is not None:
         heading = float((contact.get("dimensions") or {}).get("heading_rad") or 0.0)
@@ -272,8 +281,7 @@ def _picture(axes: Any, window: Window, pixels: NDArray[Any], **more: Any) -> No
     x = 0.05 * window.pixels
     for width, colour in ((4.5, "black"), (2.5, "white")):
         axes.plot([x, x + bar], [at, at], color=colour, lw=width, solid_capstyle="butt")
-    box = {"facecolor": "black", "alpha": 0.65, "pad": 1.5, "edgecolor": "none"}
-    axes.text(x, at - 0.025 * window.pixels, f"{length:g} m", color="white", va="bottom", bbox=box)
+    axes.text(x, at - 0.025 * window.pixels, f"{length:g} m", color="white", va="bottom", bbox=_BOX)
 
 
 def _draw_shadow(
@@ -289,30 +297,30 @@ def _draw_shadow(
     side = 1.25 * (contact["size_m"] + shadow)
     x, y = contact["position_m"]
     window = Window((x - up[0] * shadow / 2, y - up[1] * shadow / 2), side, up, _PICTURE_PX)
-    _picture(axes, window, grey_of(window, entry, "amplitude"), cmap="gray", vmin=0, vmax=255)
+    pixels = grey_of(window, entry, "amplitude", unknown=255)
+    _picture(axes, window, pixels, cmap="gray", vmin=0, vmax=255)
     for line in outlines(store, entry.info.stamp_ns, window):
         axes.plot(*np.vstack([line, line[:1]]).T, color="#ffb347", lw=1.0)
     if mesh is not None:
         for line in cast(mesh, entry.info, window):
             axes.plot(*np.vstack([line, line[:1]]).T, color="#4fd1e8", lw=1.0)
     axes.annotate(
-        "sonar",
+        "to the sonar",
         (0.5, 0.995),
-        (0.5, 0.9),
+        (0.5, 0.915),
         xycoords="axes fraction",
         ha="center",
-        color="#1fd655",
-        arrowprops={"arrowstyle": "-|>", "color": "#1fd655"},
+        va="top",
+        color="#5fe687",
+        bbox=_BOX,
+        arrowprops={"arrowstyle": "-|>", "color": "#5fe687", "lw": 1.8, "shrinkA": 0},
     )
 
 
-def _draw_colours(
-    axes: Any, store: ViewStore, contact: Mapping[str, Any], found: tuple[str, Entry] | None
-) -> None:
+def _draw_colours(axes: Any, store: ViewStore, contact: Mapping[str, Any]) -> None:
     info, _, pixels = store.pictures["color_by_aspect"]
-    shadow = shadow_m(found[1].info, contact) if found is not None else contact["size_m"]
-    window = Window(contact["position_m"], 2.2 * (contact["size_m"] / 2 + shadow), (0.0, 1.0), _PICTURE_PX)
-    _picture(axes, window, window.cut(info.grid.ground_to_pixel, pixels))
+    window = Window(contact["position_m"], _ROUND * contact["size_m"], (0.0, 1.0), _PICTURE_PX)
+    _picture(axes, window, window.cut(info.grid.ground_to_pixel, pixels, 255))
     wheel = axes.inset_axes((0.8, 0.8, 0.19, 0.19))
     y, x = np.mgrid[1:-1:120j, -1:1:120j]
     hue = (np.arctan2(y, x) / math.tau) % 1.0
@@ -358,6 +366,8 @@ def draw_side(axes: Any, mesh: trimesh.Trimesh, heading_rad: float, axis: int) -
     axes.grid(lw=0.3, color="#bbbbbb")
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=7, length=2)
+    for side in (axes.xaxis, axes.yaxis):
+        side.set_major_locator(MaxNLocator(5))
     axes.set_xlabel("m", fontsize=7, labelpad=1)
 
 
@@ -413,8 +423,7 @@ def _lay_out(figure: Figure, sheet: Sheet) -> None:
     write(
         left,
         0.568,
-        f"Amber: segmented shadow. Blue: shadow that the shape casts. Grey: {_LOW:g} to +{_HIGH:g} dB over"
-        " the view's median.\nHue: from which side it is bright.",
+        _LEGEND.replace(". Hue", ".\nHue"),
         fontsize=7,
         color="#444444",
     )
@@ -427,9 +436,9 @@ def _lay_out(figure: Figure, sheet: Sheet) -> None:
     write(0.5, 0.335, facts, linespacing=1.35)
     figure.add_artist(
         FancyBboxPatch(
-            (left, 0.122),
+            (left, 0.1),
             right - left,
-            0.078,
+            0.108,
             boxstyle="round,pad=0,rounding_size=0.004",
             facecolor="#f3f3f3",
             edgecolor="#bbbbbb",
@@ -437,13 +446,13 @@ def _lay_out(figure: Figure, sheet: Sheet) -> None:
             transform=figure.transFigure,
         )
     )
-    write(left + 0.01, 0.195, f"Judgement: {sheet.judged}"[:120], fontweight="bold")
+    write(left + 0.01, 0.203, f"Judgement: {sheet.judged}"[:120], fontweight="bold")
     remark = sheet.remark.splitlines() or ["No remarks."]
-    write(left + 0.01, 0.179, _wrapped(remark, 118, _REMARK_LINES))
-    write(left, 0.113, "Damage", fontweight="bold")
+    write(left + 0.01, 0.188, _wrapped(remark, 112, _REMARK_LINES))
+    write(left, 0.094, "Damage", fontweight="bold")
     write(
         left,
-        0.1,
+        0.081,
         _wrapped(sheet.damage or ["None is known: no view was lost or rejected."], 125, _DAMAGE_LINES),
     )
     write(left, 0.025, sheet.versions, fontsize=7, color="#444444")
@@ -451,7 +460,7 @@ def _lay_out(figure: Figure, sheet: Sheet) -> None:
 
 def _dimension_table(figure: Figure, sheet: Sheet, left: float) -> None:
     y = 0.335
-    columns = (left, left + 0.09, left + 0.26)
+    columns = (left, left + 0.09, left + 0.275)
     if not sheet.rows:
         figure.text(left, y, "No dimensions: nothing was measured.", va="top")
         return
@@ -462,13 +471,13 @@ def _dimension_table(figure: Figure, sheet: Sheet, left: float) -> None:
             figure.text(x, y - 0.019 * i, cell, va="top", fontsize=10, fontweight=weight, color=colour)
 
 
-def _png(draw: Draw) -> str:
+def _png(draw: Draw, inches: float) -> str:
     with mpl.rc_context(_STYLE):  # type: ignore[arg-type]
-        figure = Figure(figsize=(4.2, 4.2), layout="constrained")
+        figure = Figure(figsize=(inches, inches), layout="constrained")
         FigureCanvasAgg(figure)
         draw(figure.add_subplot())
         out = io.BytesIO()
-        figure.savefig(out, format="png", dpi=140)
+        figure.savefig(out, format="png", dpi=600 / inches)
     return base64.b64encode(out.getvalue()).decode()
 
 
@@ -476,9 +485,9 @@ def as_html(sheet: Sheet) -> bytes:
     """Write a report as one HTML file that asks nothing of any other."""
     safe = html.escape
 
-    def figures(entries: list[tuple[str, Draw]]) -> str:
+    def figures(entries: list[tuple[str, Draw]], inches: float) -> str:
         return "".join(
-            f'<figure><img alt="{safe(title)}" src="data:image/png;base64,{_png(draw)}">'
+            f'<figure><img alt="{safe(title)}" src="data:image/png;base64,{_png(draw, inches)}">'
             f"<figcaption>{safe(title)}</figcaption></figure>"
             for title, draw in entries
         )
@@ -507,8 +516,9 @@ def as_html(sheet: Sheet) -> bytes:
         quality_colour=_QUALITY.get(sheet.quality, "#222"),
         quality=safe(f"{sheet.verdict}; the result is {sheet.quality}" if sheet.quality else sheet.verdict),
         reasons=safe("; ".join(sheet.reasons)),
-        pictures=figures(sheet.pictures),
-        shapes=figures(sheet.shapes),
+        pictures=figures(sheet.pictures, 4.2),
+        legend=safe(_LEGEND),
+        shapes=figures(sheet.shapes, 2.8),
         table=table,
         facts=paragraphs(sheet.facts),
         judged=safe(sheet.judged),

@@ -21,9 +21,11 @@ from .store import SETS, Entry, ViewerError, ViewStore
 #: Levels from black to white, dB over the view's median: as the page opens.
 LOW_SHOWN_DB, HIGH_SHOWN_DB = -20.0, 18.0
 #: A moving picture has so many frames at most, and so many a second: a circle in some seven seconds.
-_FRAMES, _FRAMES_PER_S = 90, 12.5
+_FRAMES, _FRAMES_PER_S = 72, 10.0
 _GIF_PX = 420
-_GREEN, _AMBER, _RING = (41, 216, 90), (255, 179, 71), (143, 163, 176)
+#: Greys of a moving picture: speckle packs badly, and each halving of them takes a sixth of the file.
+_GREYS = 28
+_GREEN, _AMBER, _RING, _BACKGROUND = (41, 216, 90), (255, 179, 71), (143, 163, 176), (11, 15, 18)
 
 
 def contact_named(store: ViewStore, name: str = "") -> dict[str, Any]:
@@ -104,11 +106,16 @@ class Window:
         back = np.linalg.inv(ground_to_pixel)
         return self.place(points @ back[:2, :2].T + back[:2, 2])
 
-    def cut(self, ground_to_pixel: NDArray[Any], pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Cut it out of a picture; 0 beyond its edge."""
+    def cut(
+        self, ground_to_pixel: NDArray[Any], pixels: NDArray[np.uint8], beyond: int = 0
+    ) -> NDArray[np.uint8]:
+        """Cut it out of a picture; `beyond` where that has nothing."""
         onto = (ground_to_pixel @ self.to_ground)[:2]
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        return np.asarray(cv2.warpAffine(pixels, onto, (self.pixels, self.pixels), flags=flags))
+        border = (beyond,) * 4
+        return np.asarray(
+            cv2.warpAffine(pixels, onto, (self.pixels, self.pixels), flags=flags, borderValue=border)
+        )
 
 
 def grey(levels: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -118,10 +125,15 @@ def grey(levels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(255 * np.clip(share, 0, 1), np.uint8)
 
 
-def grey_of(window: Window, entry: Entry, kind: str) -> NDArray[np.uint8]:
-    """Return a view as greys in a window."""
-    cut = window.cut(entry.info.camera.ground_to_pixel, entry.load())
-    return grey(cut) if kind == "amplitude" else cut
+def grey_of(window: Window, entry: Entry, kind: str, unknown: int = 0) -> NDArray[np.uint8]:
+    """Return a view as greys in a window; of amplitudes, `unknown` is the grey of what no sonar has seen."""
+    onto, pixels = entry.info.camera.ground_to_pixel, entry.load()
+    cut = window.cut(onto, pixels)
+    if kind != "amplitude":
+        return cut
+    # A pixel that leans on one that is not known is none either: it would look like shadow.
+    known = window.cut(onto, np.where(pixels > 0, np.uint8(255), np.uint8(0))) == 255
+    return np.where(known, grey(cut), np.uint8(unknown))
 
 
 def outlines(store: ViewStore, stamp_ns: int, window: Window) -> list[NDArray[np.float64]]:
@@ -172,26 +184,31 @@ def moving_picture(store: ViewStore, name: str = "shadow", contact: str = "") ->
     rows, cols = np.ogrid[: window.pixels, : window.pixels]
     inside = (rows - radius + 0.5) ** 2 + (cols - radius + 0.5) ** 2 < (radius - 1) ** 2
     frames = []
+    greys = [(v, v, v) for v in np.linspace(0, 255, _GREYS).round().astype(int).tolist()]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([v for colour in (*greys, _GREEN, _AMBER, _RING, _BACKGROUND) for v in colour])
+    north = float((store.scene()["report"] or {}).get("north_deg") or 0.0)
     for entry in views:
-        picture = np.where(inside, grey_of(window, entry, SETS[name]), 0)
-        frame = Image.new("RGB", (_GIF_PX, _GIF_PX), (11, 15, 18))
-        frame.paste(Image.fromarray(picture), (room, room))
-        draw = ImageDraw.Draw(frame)
+        picture = Image.fromarray(grey_of(window, entry, SETS[name])).convert("RGB")
+        draw = ImageDraw.Draw(picture)
         for line in outlines(store, entry.info.stamp_ns, window):
-            points = [(float(x) + room, float(y) + room) for x, y in line]
-            draw.line([*points, points[0]], fill=_AMBER)
+            draw.line([*(tuple(p) for p in line.tolist()), tuple(line[0].tolist())], fill=_AMBER, width=2)
+        frame = Image.new("RGB", (_GIF_PX, _GIF_PX), _BACKGROUND)
+        frame.paste(picture, (room, room), Image.fromarray(inside))
+        draw = ImageDraw.Draw(frame)
         ring = radius + 8
         draw.ellipse((middle - ring, middle - ring, middle + ring, middle + ring), outline=_RING, width=4)
         aspect = entry.info.aspect_rad
         x, y = middle + ring * math.cos(aspect), middle - ring * math.sin(aspect)
         draw.ellipse((x - 9, y - 9, x + 9, y + 9), fill=_GREEN)
-        draw.text((6, _GIF_PX - 20), f"{math.degrees(aspect) % 360:.0f}°", fill="white", font=font)
+        bearing = round(90.0 + north - math.degrees(aspect)) % 360
+        draw.text((6, _GIF_PX - 20), f"sonar bears {bearing:03d}°", fill="white", font=font)
         draw.text((6, 4), store.title, fill="white", font=font)
         bar = _round_length(reach / 2) / window.side_m * window.pixels
         draw.line((_GIF_PX - 8 - bar, _GIF_PX - 8, _GIF_PX - 8, _GIF_PX - 8), fill="white", width=3)
         told = f"{_round_length(reach / 2):g} m"
         draw.text((_GIF_PX - 8, _GIF_PX - 12), told, fill="white", font=font, anchor="rb")
-        frames.append(frame.quantize(64, dither=Image.Dither.NONE))
+        frames.append(frame.quantize(palette=palette, dither=Image.Dither.NONE))
     out = io.BytesIO()
     options: dict[str, Any] = {"duration": round(1000 / _FRAMES_PER_S), "loop": 0}
     frames[0].save(out, "GIF", save_all=True, append_images=frames[1:], **options)

@@ -136,7 +136,7 @@ class Desk:
             items = {str(name): self._checked_item(str(name), item) for name, item in found["items"].items()}
             return {"format": FORMAT, "revision": int(found["revision"]), "items": items}
         except (CsasError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            why = str(error) if isinstance(error, CsasError) else "it is no such file"
+            why = str(error) if isinstance(error, CsasError) else f"it holds no {FORMAT!r}"
             raise ViewerError(f"{self.path} cannot be read: {why}") from error
 
     @staticmethod

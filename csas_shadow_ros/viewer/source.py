@@ -45,6 +45,8 @@ log = logging.getLogger(__name__)
 #: Width of the reduced sub-apertures of figure 5 (deg).
 REDUCED_DEG = 4.0
 RESULT_BAG = "result.mcap"
+#: So many faults are told one by one on the page.
+_TOLD = 6
 #: A truth of more triangles is not shown over the object: it would weigh more than the views.
 _MOST_FACES = 50_000
 
@@ -263,8 +265,8 @@ class PathSource:
             return
         self.problems.append(line)
         log.warning("%s", line)
-        more = f" (and {len(self.problems) - 1} more)" if len(self.problems) > 1 else ""
-        self.store.put_part("damage", f"{self.problems[0]}{more}")
+        more = f"; and {len(self.problems) - _TOLD} more" if len(self.problems) > _TOLD else ""
+        self.store.put_part("damage", "; ".join(self.problems[:_TOLD]) + more)
 
     def _use_report(self) -> None:
         p = self._report.get("parameters", {})

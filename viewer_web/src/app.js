@@ -86,7 +86,7 @@ class App {
       const newest = p.newest_s === null ? "" : `, newest ${p.newest_s < 120 ? `${p.newest_s} s` : `${Math.round(p.newest_s / 60)} min`} ago`;
       good = p.state === "running" || p.state === "finished";
       text = { running: `live: ${of}${p.rate ? ` at ${p.rate} /s` : ""}${newest}`, finished: `finished: ${of}`, silent: `the graph is silent for ${p.silent_s} s: ${of}${newest}`, waiting: `no graph is heard: ${of}` }[p.state] ?? of;
-    } else if (live) text = "live";
+    } else if (live) [text, good] = ["live: waiting for a graph", false];
     else if (p?.state === "loading") text = `reading: ${this.views(this.guide).length} views`;
     else text = `${this.views(this.guide).length} views`;
     $("link").textContent = text;
@@ -165,6 +165,7 @@ class App {
     } else if (name === "damage") {
       $("damage").hidden = !this.scene.damage;
       $("damage").textContent = $("damage").title = this.scene.damage ?? "";
+      this.desk.show();
     } else if (name === "reduced") {
       if (this.scene.reduced && this.panels.some((p) => p.layer === "reduced")) this.wantReduced();
     } else if (name === "dimensions" || name === "truth" || name === "status") this.dimensions();
@@ -205,6 +206,16 @@ class App {
     const c = this.contact, t = this.scene.target;
     if (c) return { centre: c.position_m, size: c.size_m, height: c.height_m ?? 0.4 };
     return t && { centre: t.centre, size: 0.75 * Math.max(t.size[0], t.size[1]), height: t.size[2] };
+  }
+
+  // Dimensions of the chosen contact in a second run: of its target, or of what lies nearest to a further one.
+  get mate() {
+    const { contact: c, scene: { other } } = this;
+    if (!other) return null;
+    if (!c || c.volume === "main") return other.dimensions;
+    const off = (o) => Math.hypot(o.position_m[0] - c.position_m[0], o.position_m[1] - c.position_m[1]);
+    const near = [...other.contacts].sort((a, b) => off(a) - off(b))[0];
+    return near && off(near) < c.size_m / 2 ? near.dimensions : null;
   }
 
   frame1st() {
@@ -624,7 +635,7 @@ class App {
     const c = this.contact, target = !c || c.volume === "main";
     const d = target ? this.scene.dimensions ?? c?.dimensions : c.dimensions;
     // Beside a second run there is room for nothing else.
-    const o = (target && this.scene.other?.dimensions) || null, t = o ? null : target ? this.scene.truth : c.truth, m = target && !o ? this.surfaceMeasures : null, table = $("dimensions");
+    const o = this.mate, t = o ? null : target ? this.scene.truth : c.truth, m = target && !o ? this.surfaceMeasures : null, table = $("dimensions");
     table.replaceChildren();
     const row = (cells, head) => {
       const tr = table.insertRow();

@@ -74,14 +74,14 @@ export class Desk {
   show() {
     const { app } = this, contacts = app.scene.contacts ?? [], chosen = app.contact, list = $("contacts"), report = app.scene.report;
     // Only what differs is made anew: what has the focus keeps it.
-    const told = JSON.stringify([contacts, chosen?.id, this.of("judgement").map(([id, i]) => [id, i.value.verdict]), report?.quality]);
+    const told = JSON.stringify([contacts, app.scene.live, chosen?.id, this.of("judgement").map(([id, i]) => [id, i.value.verdict]), report?.quality]);
     if (told !== this.told) {
       this.told = told;
       const focused = document.activeElement?.dataset?.contact;
       list.replaceChildren(...contacts.map((c) => this.row(c, c.id === chosen?.id)));
       if (focused) list.querySelector(`[data-contact="${CSS.escape(focused)}"]`)?.focus();
-      const q = report?.quality, verdict = report ? [report.verdict, q && q.verdict !== "good" ? q.verdict : "", ...(report.why_no_object && !contacts.length ? [report.why_no_object] : []), ...(q?.reasons ?? [])].filter(Boolean) : [];
-      $("verdict").textContent = verdict.length ? `${verdict[0]}${verdict.length > 1 ? `: ${verdict.slice(1).join("; ")}` : ""}` : contacts.length ? "" : "No contact yet.";
+      const q = report?.quality, verdict = report ? [q ? `${report.verdict}; the result is ${q.verdict}` : report.verdict, ...(report.why_no_object && !contacts.length ? [report.why_no_object] : []), ...(q?.reasons ?? [])].filter(Boolean) : [];
+      $("verdict").textContent = verdict.length ? `${verdict[0]}${verdict.length > 1 ? `: ${verdict.slice(1).join("; ")}` : ""}` : contacts.length ? "" : app.scene.live ? "No contact yet." : "This run tells of no contact.";
       $("verdict").dataset.quality = q?.verdict ?? "";
     }
     this.facts(chosen, report);
@@ -116,6 +116,7 @@ export class Desk {
     if (c?.volume === "main" && report?.hollows?.voxels) lines.push(`Hollows that no shadow shows, but echoes do: ${report.hollows.volume_m3.toFixed(3)} m³.`);
     const other = this.app.scene.other;
     if (other) lines.push(`Run B (${other.title}) is moved by ${other.moved_m.toFixed(2)} m, so that its contact lies where the first run's does.${other.damage ? ` Its damage: ${other.damage}` : ""}`);
+    for (const problem of this.app.scene.damage ? this.app.scene.damage.split("; ") : []) lines.push(`Damage: ${problem}.`);
     for (const problem of report?.problems ?? []) lines.push(`Damage: ${problem}.`);
     const text = lines.join("\n");
     if ($("facts").dataset.text === text) return;
@@ -127,7 +128,7 @@ export class Desk {
 
   form(c) {
     const form = $("judge"), item = c && this.items[c.id], draft = c && this.drafts.get(c.id), value = draft ?? item?.value ?? { verdict: "", remark: "", operator: this.operator };
-    $("judged-what").textContent = c ? c.name : "No contact";
+    $("judged-what").textContent = c ? `${c.name} is` : "No contact to judge";
     for (const field of form.querySelectorAll("input, textarea, button")) field.disabled = !c || !!this.closed;
     for (const radio of form.querySelectorAll("[name=verdict]")) radio.checked = radio.value === value.verdict;
     for (const name of ["remark", "operator"]) if (form[name] !== document.activeElement && form[name].value !== (value[name] ?? "")) form[name].value = value[name] ?? "";

@@ -221,8 +221,8 @@ export class Panel {
         g.drawImage(bitmap, -0.5, -0.5);
       }
     }
-    if (view && app.state.contour && bitmap) this.outline(g, (A) => onto(A, other), view, isOther(this.layer) ? "b." : "");
-    if (view && app.state.cast && !isOther(this.layer)) this.castOf(g, onto, view);
+    if (view && app.state.contour && bitmap) this.outline(g, (A) => onto(A, other), view, isOther(this.layer) ? "b." : "", frame.k);
+    if (view && app.state.cast && !isOther(this.layer)) this.castOf(g, onto, view, frame.k);
     g.setTransform(1, 0, 0, 1, 0, 0);
     this.furniture(g, T, view, frame);
   }
@@ -251,7 +251,7 @@ export class Panel {
           const [a, b, c, d, e, f] = inverse(A);
           tg.setTransform(T[0] * a + T[2] * d, T[1] * a + T[3] * d, T[0] * b + T[2] * e, T[1] * b + T[3] * e, T[0] * c + T[2] * f + T[4], T[1] * c + T[3] * f + T[5]);
         };
-        this.outline(tg, onto, view, "");
+        this.outline(tg, onto, view, "", k);
       }
       g.save();
       g.beginPath();
@@ -312,7 +312,7 @@ export class Panel {
     g.putImageData(screen, 0, 0);
   }
 
-  outline(g, onto, view, run) {
+  outline(g, onto, view, run, k) {
     const { app } = this, mask = app.sameStamp(`${run}shadow_mask`, view);
     const lines = mask && app.loader.lines(app.contourAddress(run, mask));
     if (!lines) return;
@@ -323,21 +323,21 @@ export class Panel {
       for (let i = 2; i < line.length; i += 2) g.lineTo(line[i], line[i + 1]);
       g.closePath();
     }
-    this.stroke(g, COLOURS.outline, 1.6);
+    this.stroke(g, COLOURS.outline, 1.6 * k);
   }
 
-  castOf(g, onto, view) {
+  castOf(g, onto, view, k) {
     const lines = this.app.castLines(view);
     if (!lines) return;
     onto(view.A);
     g.beginPath();
     for (let i = 0; i < lines.length; i += 4) { g.moveTo(lines[i], lines[i + 1]); g.lineTo(lines[i + 2], lines[i + 3]); }
-    this.stroke(g, COLOURS.cast, 1.6);
+    this.stroke(g, COLOURS.cast, 1.6 * k);
   }
 
   stroke(g, colour, width) {
     g.setTransform(1, 0, 0, 1, 0, 0);
-    g.lineWidth = width * Math.min(devicePixelRatio, 2);
+    g.lineWidth = width;
     g.strokeStyle = colour;
     g.lineJoin = "round";
     g.stroke();
@@ -352,6 +352,7 @@ export class Panel {
       g.lineWidth = 3 * k; g.strokeStyle = "#000b"; g.strokeText(text, x, y);
       g.fillStyle = colour; g.fillText(text, x, y);
     };
+    if (!view) return; // nothing says how large anything is
     // Scale bar: the roundest length of about a quarter of the picture.
     const goal = (0.5 * r) / scale, ten = 10 ** Math.floor(Math.log10(goal));
     const length = [5, 2, 1].map((m) => m * ten).find((m) => m <= goal) ?? ten, bar = length * scale;
@@ -364,7 +365,7 @@ export class Panel {
     g.beginPath(); g.moveTo(nx - 12 * k * n[0], ny - 12 * k * n[1]); g.lineTo(nx + 12 * k * n[0], ny + 12 * k * n[1]);
     g.lineWidth = 2 * k; g.strokeStyle = "#fff"; g.stroke();
     written("N", nx + 21 * k * n[0], ny + 21 * k * n[1] + 4 * k, "#fff");
-    if (view) {
+    {
       const t = view.aspect_deg * RAD, d = [T[0] * Math.cos(t) + T[2] * Math.sin(t), T[1] * Math.cos(t) + T[3] * Math.sin(t)].map((v) => v / scale);
       const tip = [half + 0.97 * r * d[0], half + 0.97 * r * d[1]];
       g.beginPath(); g.moveTo(...tip);
@@ -372,9 +373,9 @@ export class Panel {
       g.lineTo(tip[0] - 12 * k * d[0] - 5 * k * d[1], tip[1] - 12 * k * d[1] + 5 * k * d[0]);
       g.fillStyle = "#29d85a"; g.fill();
     }
-    // Contacts, by their numbers.
-    for (const c of app.scene.contacts ?? []) {
-      const [x, y] = at(c.position_m), chosen = c.id === app.state.contact;
+    // Contacts, by their numbers: a second run's are others.
+    for (const c of isOther(this.layer) ? [] : app.scene.contacts ?? []) {
+      const [x, y] = at(c.position_m), chosen = c.id === app.contact?.id;
       if (Math.hypot(x - half, y - half) > r || app.scene.contacts.length < 2) continue;
       const d = 5 * k;
       g.lineWidth = (chosen ? 2 : 1) * k; g.strokeStyle = chosen ? COLOURS.sonar : "#dfe7ec";
@@ -391,7 +392,7 @@ export class Panel {
       }
       written(told.height === undefined ? `${told.distance.toFixed(2)} m` : `h ${told.height.toFixed(2)} m`, b[0], b[1] + 18 * k, COLOURS.ruler);
     }
-    const pick = view && app.pickedGround(view);
+    const pick = app.pickedGround(view);
     if (pick) {
       const [x, y] = at(pick), d = 8 * k;
       for (const [w, c] of [[4, "#000b"], [2, COLOURS.pick]]) {

@@ -11,6 +11,9 @@ const PIECE_M = 0.5, GRID_M = 10;
 const NONE = { points: new Float32Array(0), faces: new Uint32Array(0) };
 const COLOURS = { main: 0x9fb6c4, other: 0xc4b08f, further: 0x8fb8a0, truth: 0xff6ec7, pick: 0xff7ad9 };
 
+// Shapes of a second run.
+const ofSecond = (name) => name === "b" || name.startsWith("b_");
+
 function pieces(from, to) {
   const n = Math.max(1, Math.min(400, Math.ceil(from.distanceTo(to) / PIECE_M)));
   return Array.from({ length: n + 1 }, (_, i) => from.clone().lerp(to, i / n));
@@ -114,8 +117,8 @@ export class Solid {
 
   // Axes at the corner of what is looked at, in metres east, north and up, and where true north is.
   axes() {
-    const { centre, size } = this, half = size / 2, step = size > 8 ? 5 : size > 3 ? 1 : size > 1.4 ? 0.5 : 0.2;
-    const at = [0, 1].map((i) => Math.floor((centre.getComponent(i) - half) / step) * step), n = Math.max(1, Math.round(size / step));
+    const { centre, size } = this, half = 0.42 * size, step = size > 8 ? 5 : size > 3 ? 1 : size > 1.4 ? 0.5 : 0.2;
+    const at = [0, 1].map((i) => Math.round((centre.getComponent(i) - half) / step) * step), n = Math.max(1, Math.round((2 * half) / step));
     for (const side of Object.values(this.sides)) {
       side.axes.traverse((o) => { o.geometry?.dispose(); o.material?.map?.dispose(); o.material?.dispose(); });
       side.axes.clear();
@@ -127,13 +130,14 @@ export class Solid {
         const direction = new Vector3(...d);
         line(pieces(origin, origin.clone().addScaledVector(direction, length)), colour);
         const every = Math.max(1, Math.ceil(length / step / 4));
-        for (let i = d[2] ? 1 : 0; i * step <= length + 1e-9; i += every) {
+        // The corner and the end, where others are written, have none.
+        for (let i = 1; i * step <= (d[2] ? 1 : 0.95) * length + 1e-9; i += every) {
           const p = origin.clone().addScaledVector(direction, i * step), told = p.dot(direction);
           write(told.toFixed(digits), p.x - (d[0] ? 0 : 0.04 * size), p.y - (d[1] ? 0 : 0.04 * size), p.z);
         }
       }
-      write("x m", at[0] + 1.08 * far, at[1], 0, "#e07a6a");
-      write("y m", at[0], at[1] + 1.08 * far, 0, "#7ac07a");
+      write("x m", at[0] + 1.03 * far, at[1] - 0.04 * size, 0, "#e07a6a");
+      write("y m", at[0] - 0.04 * size, at[1] + 1.03 * far, 0, "#7ac07a");
       write("z m", at[0], at[1], up + 0.07 * size, "#6a9ae0");
       const t = ((90 + (this.app.north ?? 0)) * Math.PI) / 180, tip = new Vector3(at[0] + far + 0.12 * size * Math.cos(t), at[1] + 0.12 * size * (1 + Math.sin(t)), 0);
       line([new Vector3(at[0] + far, at[1] + 0.12 * size, 0), tip], 0xffffff);
@@ -183,7 +187,7 @@ export class Solid {
   // A second run's shape is moved as its pictures are.
   place() {
     const [x, y] = this.app.offset ?? [0, 0];
-    for (const mesh of this.further.b ?? []) mesh.position.set(x, y, 0);
+    for (const [name, meshes] of Object.entries(this.further)) if (ofSecond(name)) for (const mesh of meshes) mesh.position.set(x, y, 0);
     this.dirty();
   }
 
@@ -237,7 +241,7 @@ export class Solid {
       if (name === "other") for (const each of Object.values(this.sides)) fill(each.over, shape);
     } else {
       this.further[name] ??= Object.values(this.sides).map((each) => {
-        const mesh = name === "b" ? surface(COLOURS.other, { transparent: true, opacity: 0.55 }) : surface(COLOURS.further);
+        const mesh = ofSecond(name) ? surface(COLOURS.other, { transparent: true, opacity: 0.55 }) : surface(COLOURS.further);
         each.more.add(mesh);
         return mesh;
       });
@@ -345,6 +349,7 @@ export class Solid {
       side.over.visible = this.app.state.overlay && !both && this.sides.other.triangles > 0;
       side.truth.visible = this.app.state.truth && !!side.truth.geometry.index;
       side.spot.scale.setScalar(camera.position.distanceTo(side.spot.position) * 0.008);
+      side.sonar.visible = side.ray.visible = !!this.shown;
       side.sonar.scale.setScalar(camera.position.distanceTo(side.sonar.position) * 0.012);
       renderer.setViewport(i * part, 0, part, h);
       renderer.setScissor(i * part, 0, part, h);
