@@ -1,6 +1,6 @@
 # What is asked of the page is JavaScript, and stays in one piece.
 # ruff: noqa: E501
-"""The operator's work: contacts, judging, rulers, picking, comparing; and every screen, by `make long`."""
+"""The operator's work: contacts, judging, rulers, picking, comparing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from browser import Watched
 
 from csas_shadow_ros.viewer.compare import Second
@@ -22,7 +21,6 @@ from csas_shadow_ros.viewer.store import ViewStore
 
 WEB = Path(__file__).resolve().parents[2] / "viewer_web"
 STATIC = WEB.parent / "csas_shadow_ros" / "viewer" / "static"
-SCREENS = ((1366, 768), (1920, 1080), (3840, 2160), (1024, 768), (390, 844))
 
 
 def read(folder: Path) -> ViewStore:
@@ -277,75 +275,3 @@ def test_the_page_is_built_of_its_sources(tmp_path):
     subprocess.run(command, shell=True, cwd=WEB, check=True, capture_output=True)
     for name in ("app.js", "worker.js"):
         assert (tmp_path / name).read_bytes() == (STATIC / name).read_bytes(), f"{name}: npm run build"
-
-
-# Every screen
-
-
-@pytest.fixture(scope="session")
-def three(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A real run with three objects: a minute."""
-    from csas_shadow_ros.cli import main
-
-    place = tmp_path_factory.mktemp("three")
-    bodies = []
-    for x, y, size, turn in (
-        (0, 0, (0.8, 0.4, 0.4), 0.35),
-        (1.2, 0.8, (0.5, 0.4, 0.4), -0.5),
-        (-1.1, -0.9, (0.5, 0.35, 0.4), 1.2),
-    ):
-        body = trimesh.creation.box(size)
-        body.apply_transform(trimesh.transformations.rotation_matrix(turn, (0, 0, 1)))
-        body.apply_translation((x, y, size[2] / 2))
-        bodies.append(body)
-    trimesh.util.concatenate(bodies).export(place / "three.stl")
-    bag = str(place / "bag")
-    assert main(["simulate", bag, "--target", str(place / "three.stl"), "-q"]) == 0
-    given = ["--out", str(place / "run"), "--step-deg", "5", "--voxel-size-m", "0.03", "--no-figures", "-q"]
-    assert main(["run", bag, *given]) == 0
-    return place / "run"
-
-
-@pytest.fixture(scope="session")
-def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """axe-core, from npm: a tool of the tests alone, under a licence of its own (MPL)."""
-    npm = shutil.which("npm")
-    if npm is None:
-        pytest.skip("no npm to get axe-core with")
-    place = tmp_path_factory.mktemp("axe")
-    got = subprocess.run(
-        [npm, "install", "--prefix", str(place), "axe-core@4.10.3"], capture_output=True, text=True
-    )
-    if got.returncode:
-        pytest.skip(f"npm cannot get axe-core: {got.stderr.strip().splitlines()[-1][:200]}")
-    return (place / "node_modules" / "axe-core" / "axe.min.js").read_text(encoding="utf-8")
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("width", "height"), SCREENS)
-def test_on_every_screen_all_is_there_and_axe_finds_nothing(watched, serve, three, axe, width, height):
-    store = read(three)
-    assert sum(c["kind"] == "object" for c in store.scene()["contacts"]) >= 3
-    watched.page.set_viewport_size({"width": width, "height": height})
-    watched.open(serve(store))
-    watched.settle()
-    for contact in ("object-2", "object-3", "object-1"):
-        watched.page.click(f"[data-contact={contact}]")
-        place = watched.js("csas.contact.position_m")
-        assert watched.js("csas.state.centre") == pytest.approx(place)
-    watched.js("csas.newRuler([0, -0.3], [0, -0.8]), csas.desk.bookmark()")
-    watched.until("document.querySelectorAll('#bookmarks li').length === 1")
-    assert watched.js("document.documentElement.scrollWidth <= innerWidth")
-    if width > 1100:
-        assert watched.js("document.documentElement.scrollHeight <= innerHeight")
-        side = watched.js("csas.panels[1].slider.side")
-        assert side > 0.34 * width or side > 0.6 * height, "the pictures use the room that there is"
-    out = watched.js(
-        "[...document.querySelectorAll('button, select, input, textarea, csas-slider')].filter(e => e.offsetParent && !e.closest('#finding') && (r => r.right > innerWidth + 1 || r.left < -1 || r.width < 8)(e.getBoundingClientRect())).map(e => e.id || e.tagName)"
-    )
-    assert out == []
-    watched.js(axe)  # by the debugger: the page itself takes no script but its own
-    found = watched.js(
-        "axe.run().then(r => r.violations.map(v => `${v.id}: ${v.nodes.map(n => n.target).join(' ')}`))"
-    )
-    assert found == []
