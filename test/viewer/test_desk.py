@@ -17,6 +17,7 @@ from csas_shadow_ros.cli import main
 from csas_shadow_ros.core.errors import ParameterError
 from csas_shadow_ros.results.check import check_results
 from csas_shadow_ros.viewer.desk import FILE, Desk
+from csas_shadow_ros.viewer.source import PathSource
 from csas_shadow_ros.viewer.store import ViewerError, ViewStore
 
 CONTACT = "object-1"
@@ -190,6 +191,44 @@ def test_on_the_network_a_judgement_needs_the_token_too(serve: Any, tmp_path: Pa
     assert post(f"{at}?token={token}", body)[0] == 200
 
 
+def files(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_the_page_can_write_nothing_else(serve: Any, results: Path, tmp_path: Path) -> None:
+    import shutil
+
+    folder = tmp_path / "run"
+    shutil.copytree(results, folder)
+    store = ViewStore()
+    source = PathSource(store, folder)
+    source.start()
+    assert source.done.wait(60)
+    url, before = serve(store), files(folder)
+    at, stamp = urlparse(url), next(iter(store.sets["shadow"]))
+    api = ("scene", "desk", f"view/shadow/{stamp}/x.png", f"contour/{stamp}/x.json", "volume/main/x.bin",
+           "surface/main.json", "mesh/main.stl", "reduced", "export.html", "circle.gif",
+           "report.pdf")  # fmt: skip
+    paths = ["/", "/ws", "/static/app.js", "/desk.json", "/../grid.npz", "/report.json"]
+    paths += [f"/api/{name}" for name in api]
+    sent = {"Content-Type": "application/json", "Origin": f"http://{at.netloc}"}
+    for path in paths:
+        for method in ("POST", "PUT", "DELETE", "PATCH"):
+            if (method, path) == ("POST", "/api/desk"):
+                continue
+            connection = http.client.HTTPConnection(at.hostname or "", at.port, timeout=10)
+            connection.request(method, path, json.dumps({"items": [judged("undecided")]}), sent)
+            assert connection.getresponse().status in (404, 405), (method, path)
+            connection.close()
+    for name in ("../report", "report.json", "a/b", "", "A", "x" * 65):
+        assert post(url, {"items": [judged("undecided", name=name)]})[0] == 400, name
+    assert files(folder) == before
+    assert post(url, {"items": [judged("undecided")]})[0] == 200
+    after = files(folder)
+    assert after.keys() - before.keys() == {FILE}
+    assert {name: after[name] for name in before} == before
+
+
 def test_where_there_is_no_folder_nothing_is_written(serve: Any) -> None:
     status, told = post(serve(ViewStore()), {"items": [judged("undecided")]})
     assert status == 409
@@ -247,6 +286,27 @@ def test_the_circle_is_a_moving_picture_of_every_view(results: Path, tmp_path: P
     with Image.open(path) as picture:
         assert picture.n_frames == 72
         assert picture.size == (420, 420)
+        colours = {c for _, c in picture.convert("RGB").getcolors() or []}
+        assert (41, 216, 90) in colours, "the sonar is green"
+        assert len(colours) <= 32
         first = picture.convert("RGB").tobytes()
         picture.seek(18)
         assert picture.convert("RGB").tobytes() != first
+
+
+def test_what_no_sonar_has_seen_is_not_printed_as_shadow() -> None:
+    import numpy as np
+    from synthetic import PIXELS, SPACING_M, entry
+
+    from csas_shadow_ros.viewer.crop import Window, grey_of
+
+    one = entry(0)
+    pixels = one.load().copy()
+    pixels[: PIXELS // 2] = 0
+    half = type(one)(one.info, "half", lambda: pixels)
+    window = Window((0.0, 0.0), 1.5 * PIXELS * SPACING_M, (0.6, 0.8), 300)
+    seen, whole = grey_of(window, half, "amplitude", 255), grey_of(window, one, "amplitude", 255)
+    level = whole[150, 150]
+    assert set(np.unique(whole)) == {level, 255}
+    assert set(np.unique(seen)) == {level, 255}, "no dark fringe where what is known ends"
+    assert (seen == level).sum() == pytest.approx((whole == level).sum() / 2, rel=0.03)

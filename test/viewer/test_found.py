@@ -212,6 +212,7 @@ def test_sonar_up_turns_the_circle_with_the_picture(watched, serve):
     assert cursor(watched) == pytest.approx(90, abs=1)
 
 
+@pytest.mark.long
 def test_the_track_is_seen_whole_and_no_line_of_the_seabed_is_long(watched, serve, run_store):
     watched.open(serve(run_store))
     for size in ({"width": 1366, "height": 768}, {"width": 1024, "height": 768}):
@@ -414,6 +415,10 @@ def test_a_replay_can_be_watched_and_its_page_goes_on_with_the_results(watched, 
                 watched.page.wait_for_timeout(100)
         watched.until("window.csas && csas.views('shadow').length > 3", 60)
         assert watched.js("csas.scene.live")
+        for width, height in ((1920, 1080), (3840, 2160), (1024, 768), (390, 844)):
+            watched.page.set_viewport_size({"width": width, "height": height})
+            watched.drawn()
+            assert watched.js("document.documentElement.scrollWidth <= innerWidth")
         watched.until(
             "!csas.scene.live && csas.views('shadow').length === 36 && csas.scene.contacts.length", 90
         )

@@ -91,6 +91,11 @@ def test_a_contact_that_is_chosen_is_gone_to_judged_and_kept(watched, serve, sev
     watched.until(
         "document.querySelector('#earlier').textContent.includes('mine-like by A. Smith (fins at one end)')"
     )
+    # And both at once, neither waiting for the other.
+    for one in (watched, other):
+        one.js("void [1, 2, 3, 4, 5].forEach(() => csas.desk.bookmark())")
+    for one in (watched, other):
+        one.until("document.querySelectorAll('#bookmarks li').length === 11")
     other.page.close()
     # After a restart, and in a saved file, it is all there.
     again = read(several)
@@ -143,6 +148,7 @@ def test_rulers_belong_to_their_aspect_have_ends_and_refuse_what_is_no_shadow(wa
     watched.until("csas.current.aspect_deg === 90")
 
 
+@pytest.mark.long
 def test_a_point_of_the_shape_is_its_shadow_in_the_picture_and_a_point_of_the_picture_its_line(
     watched, serve, run_store
 ):
