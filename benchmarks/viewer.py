@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csas_shadow_ros.core.geometry import Acoustics, ShadowCamera, ViewInfo, view_ground_to_pixel
+from csas_shadow_ros.core.masks import MASK_SHADOW
 from csas_shadow_ros.core.volume import Volume, VoxelGrid
 from csas_shadow_ros.viewer.codes import amplitude_codes
 from csas_shadow_ros.viewer.server import ViewerServer
@@ -60,10 +61,32 @@ def seen(aspect_rad: float) -> NDArray[np.bool_]:
     return np.asarray(np.maximum(abs(cos * u + sin * v), abs(cos * v - sin * u)) < SIDE / math.sqrt(8))
 
 
+def told(store: ViewStore) -> None:
+    """Put in what the page draws over and round its pictures: contacts, evidence of each view."""
+    d = {"length_m": 0.8, "width_m": 0.4, "height_m": 0.4, "volume_m3": 0.13, "heading_rad": 0.4}
+    contacts = [
+        {"id": f"object-{i}", "name": f"Contact {i}", "kind": "object"}
+        | {"position_m": [i - 2.0, 0.5 * i - 1.0]}
+        | {"size_m": 0.8, "height_m": 0.4, "dimensions": d, "geographic": None}
+        | {"volume": "main" if i == 1 else f"object_{i}"}
+        for i in (1, 2, 3)
+    ]
+    heights = [[i, 0.4 + 0.1 * math.sin(i), 0.3 * (i % 3), 0.0] for i in range(VIEWS)]
+    report = {"verdict": "object", "quality": {"verdict": "good", "reasons": []}, "heights": heights}
+    report |= {"height_median_m": 0.4, "rejected": [[30.0, "too dark"]], "views": {"in": VIEWS}}
+    store.put_part("report", report)
+    store.put_part("contacts", contacts)
+
+
 def synthetic_store() -> ViewStore:
-    """Speckle, its own in each of eight pictures, and a ball in a volume of 128 x 128 x 64."""
+    """Speckle, its own in each of eight pictures, with outlines, and a ball in a volume of 128 x 128 x 64."""
     store, rng = ViewStore(title="benchmark"), np.random.default_rng(1)
     pictures = [amplitude_codes(speckle(rng)) for _ in range(8)]
+    # Three shadows with ragged edges.
+    ragged = cv2.GaussianBlur(rng.normal(size=(SIDE, SIDE)), (0, 0), 3.0) * 40.0
+    v, u = np.indices((SIDE, SIDE))
+    dark = [np.maximum(abs(u - x) - 60, abs(v - 420) - 110) + ragged < 0 for x in (200, 400, 600)]
+    mask = np.where(np.any(dark, axis=0), MASK_SHADOW, np.uint8(0)).astype(np.uint8)
     for i in range(VIEWS):
         aspect = math.tau * i / VIEWS
         sonar = (75 * math.cos(aspect), 75 * math.sin(aspect), 30.0)
@@ -74,6 +97,8 @@ def synthetic_store() -> ViewStore:
         for k, name in enumerate(("sub_aperture", "shadow")):
             codes = np.where(seen(aspect), np.roll(pictures[(i + k) % 8], 17 * i, axis=1), np.uint8(0))
             store.put_view(name, Entry(info, f"{i}", lambda codes=codes: codes))
+        store.put_view("shadow_mask", Entry(info, f"{i}", lambda: mask))
+    told(store)
     volume = Volume.around((0.0, 0.0), (2.56, 2.56, 1.28), 0.02)
     z, y, x = np.meshgrid(volume.z_m, volume.y_m, volume.x_m, indexing="ij")
     likelihood = np.clip(np.sqrt(x**2 + y**2 + (z - 0.5) ** 2) / 3, 0, 1).astype(np.float32)
@@ -130,9 +155,9 @@ async def _drag(port: int, circle: list[float]) -> None:
                 await line.send_json({"id": i + 1, "method": "Input.dispatchMouseEvent", "params": move})
 
 
-def scrub(watched: Watched, port: int) -> dict[str, Any]:
-    """Drag the cursor once round the circle in six seconds, `DRAGS` times; return what is typical."""
-    drags = [_scrubbed(watched, port) for _ in range(DRAGS)]
+def scrub(watched: Watched, port: int, panel: int = 1) -> dict[str, Any]:
+    """Drag the cursor once round a panel's circle in six seconds, `DRAGS` times; return what is typical."""
+    drags = [_scrubbed(watched, port, panel) for _ in range(DRAGS)]
     rate, median, p95 = (round(float(np.median(column)), 1) for column in zip(*drags, strict=True))
     return {
         "mouse_events_per_s": MOUSE_HZ,
@@ -143,10 +168,10 @@ def scrub(watched: Watched, port: int) -> dict[str, Any]:
     }
 
 
-def _scrubbed(watched: Watched, port: int) -> tuple[float, float, float]:
+def _scrubbed(watched: Watched, port: int, panel: int) -> tuple[float, float, float]:
     """Drag once; return views a second, and median and 95th percentile (ms) of event to picture."""
     circle = watched.js(
-        "(() => { const s = csas.panels[1].slider, b = s.ring.getBoundingClientRect();"
+        f"(() => {{ const s = csas.panels[{panel}].slider, b = s.ring.getBoundingClientRect();"
         " return [b.left + s.side / 2, b.top + s.side / 2, s.radius]; })()"
     )
     mouse = watched.page.mouse
@@ -179,6 +204,12 @@ def measure(store: ViewStore) -> dict[str, Any]:
             watched.until("csas.loader.all.length === 0 && csas.loader.busy.size === 0", 300)
             out["memory_mb_all_views_loaded"] = round(memory_mb(browser, watched.page))
             out["scrub"] = scrub(watched, port)
+            watched.js("csas.panels[1].choose('six_shadow')")
+            watched.until("csas.panels[1].sixWanted?.every(a => csas.loader.bitmap(a))")
+            out["scrub_beside_six_views"] = scrub(watched, port, 0)
+            watched.js("csas.panels[1].choose('shadow'), csas.turn()")
+            out["scrub_sonar_up"] = scrub(watched, port, 0)
+            watched.js("csas.turn()")
             watched.until("!csas.busySurface && csas.stats.surfaces.length > 0", 30)
             watched.js("csas.stats.surfaces = []")
             for step in range(40):
