@@ -26,6 +26,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from .. import __version__
+from ..core.masks import MASK_SHADOW
 from ..core.mesh import mesh_from_grid
 from .crop import HIGH_SHOWN_DB as _HIGH
 from .crop import LOW_SHOWN_DB as _LOW
@@ -45,6 +46,8 @@ _QUALITY = {"good": "#1d7a3c", "limited": "#9a5b00", "not trustworthy": "#b3261e
 _BOX = {"facecolor": "black", "alpha": 0.65, "pad": 1.5, "edgecolor": "none"}
 #: Side of the picture in colour, in sizes of the contact: it and what stands beside it.
 _ROUND = 3.0
+#: So many views are tried for a further contact, at so many places of its shadow.
+_TRIED, _SAMPLES = 36, 40
 #: Lines of text that the page has room for; more are counted.
 _REMARK_LINES, _DAMAGE_LINES = 7, 4
 _ROWS = (
@@ -238,6 +241,28 @@ def best_view(store: ViewStore, report: Mapping[str, Any]) -> tuple[str, Entry] 
     return name, views[0]
 
 
+def view_of_shadow(store: ViewStore, contact: Mapping[str, Any]) -> tuple[str, Entry] | None:
+    """Return the view in which most of a contact's shadow was segmented; None where nobody knows."""
+    name = next((n for n in ("shadow", "sub_aperture") if store.sets[n]), None)
+    masks = sorted(store.sets["shadow_mask"].values(), key=lambda one: one.info.aspect_rad)
+    masks = [m for m in masks if name is not None and m.info.stamp_ns in store.sets[name]]
+    if name is None or not masks:
+        return None
+    size = float(contact["size_m"])
+
+    def share(one: Entry) -> float:
+        away = -np.array([math.cos(one.info.aspect_rad), math.sin(one.info.aspect_rad)])
+        reach = np.linspace(size / 2, shadow_m(one.info, contact), _SAMPLES)
+        points = np.asarray(contact["position_m"]) + reach[:, None] * away
+        onto, mask = one.info.camera.ground_to_pixel, one.load()
+        u, v = np.rint(onto[:2, :2] @ points.T + onto[:2, 2:]).astype(int)
+        inside = (u >= 0) & (v >= 0) & (v < mask.shape[0]) & (u < mask.shape[1])
+        return float(np.mean(inside & (mask[v * inside, u * inside] == MASK_SHADOW)))
+
+    best = max(masks[:: math.ceil(len(masks) / _TRIED)], key=share)
+    return name, store.sets[name][best.info.stamp_ns]
+
+
 def _surface(store: ViewStore, contact: Mapping[str, Any]) -> trimesh.Trimesh | None:
     grid = store.grids.get(str(contact.get("volume", "")))
     return mesh_from_grid(grid) if grid is not None and grid.occupied.any() else None
@@ -246,7 +271,9 @@ def _surface(store: ViewStore, contact: Mapping[str, Any]) -> trimesh.Trimesh | 
 def _add_pictures(
     sheet: Sheet, store: ViewStore, contact: Mapping[str, Any], report: Mapping[str, Any]
 ) -> None:
-    mesh, found = _surface(store, contact), best_view(store, report)
+    # How well each view is explained is known of the target alone.
+    found = None if contact.get("volume") == "main" else view_of_shadow(store, contact)
+    mesh, found = _surface(store, contact), found or best_view(store, report)
     if found is not None:
         name, entry = found
         aspect = math.degrees(entry.info.aspect_rad) % 360.0
@@ -528,4 +555,4 @@ def as_html(sheet: Sheet) -> bytes:
     ).encode()
 
 
-__all__ = ["Sheet", "as_html", "as_pdf", "best_view", "sheet_of"]
+__all__ = ["Sheet", "as_html", "as_pdf", "best_view", "sheet_of", "view_of_shadow"]
