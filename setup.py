@@ -172,7 +172,7 @@ setup(
     entry_points={
         "console_scripts": [
             "csas-shadow = csas_shadow_ros.__main__:main",
-            *(f"{node} = {NAME}.nodes.start:{node}" for node in NODES),
+            *(f"{node} = {NAME}.nodes.runtime.start:{node}" for node in NODES),
         ]
     },
     zip_safe=False,

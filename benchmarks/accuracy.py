@@ -38,10 +38,9 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 import csas_shadow_ros
-from csas_shadow_ros.core.carving import Carver
 from csas_shadow_ros.core.errors import CsasError, ViewError
 from csas_shadow_ros.core.geometry import View
-from csas_shadow_ros.core.mesh import measure, mesh_from_grid
+from csas_shadow_ros.core.imaging.segmentation import require_silhouette
 from csas_shadow_ros.core.parameters import (
     CarvingParameters,
     PipelineParameters,
@@ -49,8 +48,9 @@ from csas_shadow_ros.core.parameters import (
     SubApertureParameters,
 )
 from csas_shadow_ros.core.pipeline import ProcessedView, Result, run
-from csas_shadow_ros.core.segmentation import require_silhouette
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.shape.carving import Carver
+from csas_shadow_ros.core.shape.mesh import measure, mesh_from_grid
+from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 from csas_shadow_ros.simulation import (
     PROFILES,
     Faults,

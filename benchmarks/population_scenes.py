@@ -10,8 +10,8 @@ from functools import lru_cache
 import numpy as np
 import trimesh
 
-from csas_shadow_ros.core.mesh import measure
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
+from csas_shadow_ros.core.shape.mesh import measure
 from csas_shadow_ros.simulation import Bump, Faults, Patch, Profile, Scene, Seabed, SimulatedRun, simulate
 from csas_shadow_ros.simulation.bodies import (
     Parts,

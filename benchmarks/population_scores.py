@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from population_scenes import SceneSpec, draw, shadow_length_m
 
 from csas_shadow_ros.core.errors import CsasError
-from csas_shadow_ros.core.mesh import measure
 from csas_shadow_ros.core.pipeline import Result, run
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.shape.mesh import measure
+from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 from csas_shadow_ros.from_bag import refuse_contradictions
 from csas_shadow_ros.simulation import SimulatedRun, iou, shadow_hull, voxelise_truth
 

@@ -40,7 +40,6 @@ from matplotlib.ticker import NullFormatter
 
 from csas_shadow_ros.bags import read_run
 from csas_shadow_ros.core import reference
-from csas_shadow_ros.core.carving import Carver
 from csas_shadow_ros.core.geometry import (
     CoherentImage,
     GroundGrid,
@@ -49,13 +48,14 @@ from csas_shadow_ros.core.geometry import (
     View,
     view_ground_to_pixel,
 )
-from csas_shadow_ros.core.likelihood import l_out, outside_likelihood, view_levels
+from csas_shadow_ros.core.imaging.enhancement import enhance
+from csas_shadow_ros.core.imaging.likelihood import l_out, outside_likelihood, view_levels
+from csas_shadow_ros.core.imaging.segmentation import require_silhouette, segment_shadow
+from csas_shadow_ros.core.imaging.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters
-from csas_shadow_ros.core.segmentation import require_silhouette, segment_shadow
-from csas_shadow_ros.core.shadow import enhance
-from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
+from csas_shadow_ros.core.shape.carving import Carver
+from csas_shadow_ros.core.shape.volume import Target, Volume
 from csas_shadow_ros.core.threads import in_order
-from csas_shadow_ros.core.volume import Target, Volume
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
@@ -357,7 +357,7 @@ print(time.perf_counter() - began, result.views_used, int(result.grid.occupied.s
 GRAPH = """
 import sys, time
 began = time.perf_counter()
-from csas_shadow_ros.replay import replay
+from csas_shadow_ros.graph.replay import replay
 result = replay(sys.argv[1], progress=False)
 print(time.perf_counter() - began, result.views_used, int(result.grid.occupied.sum()))
 """

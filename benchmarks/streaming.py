@@ -34,10 +34,10 @@ from csas_shadow_ros.core.parameters import (
     SubApertureParameters,
     TargetParameters,
 )
-from csas_shadow_ros.core.streaming import Stream
-from csas_shadow_ros.core.volume import Target
-from csas_shadow_ros.graph import DomainReservation, Graph
-from csas_shadow_ros.replay import _Watcher, node_parameters
+from csas_shadow_ros.core.sectors.streaming import Stream
+from csas_shadow_ros.core.shape.volume import Target
+from csas_shadow_ros.graph.processes import DomainReservation, Graph
+from csas_shadow_ros.graph.replay import _Watcher, node_parameters
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.sectors import sectors_of_run
 

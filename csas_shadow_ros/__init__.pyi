@@ -1,13 +1,13 @@
 from .bags import Run, check_bag, read_run, write_run
 from .core.errors import CsasError, InputTypeError, MissingExtraError, ParameterError
 from .core.geometry import Acoustics, CoherentImage, Datum, GroundGrid, Track, View
-from .core.mesh import Dimensions
+from .core.imaging.subaperture import SubApertures
 from .core.parameters import PipelineParameters
+from .core.shape.mesh import Dimensions
 from .core.shape.result import Quality, Result
-from .core.subaperture import SubApertures
-from .core.volume import VoxelGrid
-from .process import process_bag
+from .core.shape.volume import VoxelGrid
 from .public import parameters, reconstruct
+from .run_bag import process_bag
 from .simulation import Faults, SimulatedRun, simulate, simulate_bag
 
 __all__ = [

@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 
 from . import __version__
 from .core.errors import CsasError, ParameterError
-from .core.frame_name import SCENE_FRAME
+from .core.geometry.frame_name import SCENE_FRAME
 from .core.parameters import STAGES, START_FROM, PipelineParameters, PlaceParameters
 
 PROGRAM = "csas-shadow"
@@ -951,9 +951,9 @@ def _info(arguments: argparse.Namespace, console: Console) -> int:
         console.result(text + f", {len(drawn)} figures", report)
         return OK
     from .bags import read_run
-    from .process import describe_run, stages_of, topic_sizes
     from .results import read_truth
     from .results.report import json_ready
+    from .run_bag import describe_run, stages_of, topic_sizes
 
     run = read_run(arguments.path, arguments.namespace)
     about = describe_run(run)
@@ -1027,7 +1027,7 @@ def _bag_text(about: dict[str, Any]) -> str:
 
 
 def _run(arguments: argparse.Namespace, console: Console) -> int:
-    from .process import process_bag
+    from .run_bag import process_bag
 
     parameters = parameters_of(arguments)
     if arguments.workers < 1:
@@ -1162,7 +1162,7 @@ def _export(arguments: argparse.Namespace, console: Console) -> int:
 
 
 def _replay(arguments: argparse.Namespace, console: Console) -> int:
-    from .process import replay_bag
+    from .run_bag import replay_bag
 
     parameters = parameters_of(arguments)
     port = _show_beside(console, browser=not arguments.no_browser) if arguments.view else None

@@ -22,7 +22,7 @@ from rclpy.signals import uninstall_signal_handlers
 
 from csas_shadow_ros.core.errors import CsasError, ParameterError
 from csas_shadow_ros.core.geometry import View, ViewInfo, looks_at
-from csas_shadow_ros.core.masks import MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
+from csas_shadow_ros.core.imaging.masks import MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from msg_adapters import (
     VIEW_STREAMS,
     RclpyMessages,
@@ -38,8 +38,8 @@ from msg_adapters.topics import stream as stream_of
 from msg_adapters.topics import topic as topic_of
 
 from .nodes import qos
-from .nodes.base import BEAT_S, Inlet, ViewOutlet
-from .nodes.flow import place_of
+from .nodes.runtime.base import BEAT_S, Inlet, ViewOutlet
+from .nodes.runtime.flow import place_of
 
 #: What a callback gives back: nothing, the pixels of its result, or in words why it cannot use the view.
 Answer = NDArray[Any] | str | None

@@ -16,11 +16,11 @@ from .bags import Problem, Run
 from .bags.check import ERROR, judge_amplitude, judge_coverage, judge_image, judge_sectors
 from .core.errors import BagError, ParameterError, SpectrumSignError
 from .core.geometry import CoherentImage, Track, View, looks_at
+from .core.later_stages import STAGES, run_views, with_spectrum_sign
 from .core.parameters import MAX_OBJECTS, START_FROM, PipelineParameters, Stage
 from .core.pipeline import ProcessedView, Result
 from .core.pipeline import run as run_pipeline
 from .core.search.decision import Decision, decide_by_views
-from .core.stages import STAGES, run_views, with_spectrum_sign
 
 Progress = Callable[[int, int], None]
 Notice = Callable[[str], None]

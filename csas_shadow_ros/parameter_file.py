@@ -73,7 +73,7 @@ def read_parameter_file(path: str | Path) -> dict[str, Any]:
         range, or two nodes contradict each other.
     """
     # Here and not above: the nodes' package stands over this one. It needs no ROS either.
-    from .nodes.params import NODES, OF_RCLPY
+    from .nodes.runtime.params import NODES, OF_RCLPY
 
     try:
         document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))

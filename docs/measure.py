@@ -31,16 +31,14 @@ import scipy.ndimage
 import trimesh
 from numpy.typing import NDArray
 
-from csas_shadow_ros.core import likelihood, measurement, reference, segmentation
-from csas_shadow_ros.core.carving import Carver
-from csas_shadow_ros.core.echo import layover_per_metre
+from csas_shadow_ros.core import reference
 from csas_shadow_ros.core.geometry import ShadowCamera, Track, View, ViewInfo
-from csas_shadow_ros.core.hollows import EchoLook, _looks, _surface
-from csas_shadow_ros.core.likelihood import Levels, box_mean
-from csas_shadow_ros.core.local_means import LocalMeans
-from csas_shadow_ros.core.masks import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
-from csas_shadow_ros.core.measurement import SilhouetteSides
-from csas_shadow_ros.core.mesh import measure
+from csas_shadow_ros.core.imaging import likelihood, segmentation
+from csas_shadow_ros.core.imaging.enhancement import enhance, focus_range
+from csas_shadow_ros.core.imaging.likelihood import Levels, box_mean
+from csas_shadow_ros.core.imaging.local_means import LocalMeans
+from csas_shadow_ros.core.imaging.masks import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
+from csas_shadow_ros.core.imaging.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.core.parameters import (
     CarvingParameters,
     PipelineParameters,
@@ -49,11 +47,15 @@ from csas_shadow_ros.core.parameters import (
     TargetParameters,
 )
 from csas_shadow_ros.core.pipeline import ProcessedView, run
-from csas_shadow_ros.core.shadow import enhance, focus_range
-from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
-from csas_shadow_ros.core.target import SignEvidence, spectrum_sign_evidence
-from csas_shadow_ros.core.threshold import occupied_voxels, supported
-from csas_shadow_ros.core.volume import Target, Volume, VoxelGrid
+from csas_shadow_ros.core.search.bodies import SignEvidence, spectrum_sign_evidence
+from csas_shadow_ros.core.shape import measurement
+from csas_shadow_ros.core.shape.carving import Carver
+from csas_shadow_ros.core.shape.hollows import EchoLook, _looks, _surface
+from csas_shadow_ros.core.shape.layover import layover_per_metre
+from csas_shadow_ros.core.shape.measurement import SilhouetteSides
+from csas_shadow_ros.core.shape.mesh import measure
+from csas_shadow_ros.core.shape.threshold import occupied_voxels, supported
+from csas_shadow_ros.core.shape.volume import Target, Volume, VoxelGrid
 from csas_shadow_ros.simulation import Faults, simulate
 from csas_shadow_ros.simulation.hull import iou, shadow_hull, voxelise_truth
 from csas_shadow_ros.simulation.scene import SceneModel

@@ -27,12 +27,12 @@ from numpy.typing import NDArray
 from real_data import data_file
 
 from csas_shadow_ros.bags import read_run, write_run
-from csas_shadow_ros.core.composites import Composites, level_image
 from csas_shadow_ros.core.errors import CsasError
 from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, Track
+from csas_shadow_ros.core.imaging.composites import Composites, level_image
+from csas_shadow_ros.core.imaging.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters
 from csas_shadow_ros.core.pipeline import Result, run
-from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
 
 FILE = "airsas_small_features_cutout_20k_mic1.npy"
 EPOCH_NS = 1_700_000_000_000_000_000

@@ -38,11 +38,11 @@ from csas_shadow_ros.core.geometry import (
     down_range_axis,
     unit_to_sonar,
 )
-from csas_shadow_ros.core.mesh import Dimensions, measure, mesh_from_grid
+from csas_shadow_ros.core.later_stages import run_views
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters
 from csas_shadow_ros.core.pipeline import ProcessedView, Result
-from csas_shadow_ros.core.stages import run_views
-from csas_shadow_ros.core.volume import VoxelGrid
+from csas_shadow_ros.core.shape.mesh import Dimensions, measure, mesh_from_grid
+from csas_shadow_ros.core.shape.volume import VoxelGrid
 from msg_adapters.messages import RosbagsMessages
 from msg_adapters.pairs import view_to_msgs
 

@@ -22,8 +22,8 @@ from csas_shadow_ros.core.geometry import (
     down_range_axis,
     wrap_angle,
 )
-from csas_shadow_ros.core.sector import Sector
-from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.sectors.sector import Sector
+from csas_shadow_ros.core.shape.volume import Volume
 
 from .messages import (
     MAX_COORDINATE_M,

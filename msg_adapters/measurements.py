@@ -11,10 +11,10 @@ import numpy as np
 
 from csas_shadow_ros.core.errors import AdapterError, CsasError
 from csas_shadow_ros.core.geometry import SCENE_FRAME, Datum, Place
-from csas_shadow_ros.core.mesh import Dimensions
-from csas_shadow_ros.core.seabed import SeabedSlope
+from csas_shadow_ros.core.shape.mesh import Dimensions
 from csas_shadow_ros.core.shape.result import QUALITIES, VERDICTS, LeftOut, ObjectResult, Quality, Result
-from csas_shadow_ros.core.volume import Target, VoxelGrid
+from csas_shadow_ros.core.shape.seabed import SeabedSlope
+from csas_shadow_ros.core.shape.volume import Target, VoxelGrid
 
 from .messages import MessageFactory, frame_of, quoted
 from .progress import Level
@@ -36,7 +36,7 @@ from .statuses import (
 from .topics import LAST_FURTHER
 
 if TYPE_CHECKING:
-    from csas_shadow_ros.core.target import SignEvidence
+    from csas_shadow_ros.core.search.bodies import SignEvidence
 
 _WHERE = "measurements"
 _OBJECT = "object"

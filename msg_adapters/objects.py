@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from csas_shadow_ros.core.errors import AdapterError
-from csas_shadow_ros.core.mesh import Dimensions
+from csas_shadow_ros.core.shape.mesh import Dimensions
 from csas_shadow_ros.core.shape.result import Result
 
 from .measurements import half_width, numbered_objects

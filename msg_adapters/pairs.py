@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from csas_shadow_ros.core.errors import AdapterError
 from csas_shadow_ros.core.geometry import CoherentImage, View
-from csas_shadow_ros.core.sector import Sector
-from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.sectors.sector import Sector
+from csas_shadow_ros.core.shape.volume import Volume
 
 from .camera_info import (
     GroundInfo,

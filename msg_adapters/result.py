@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from csas_shadow_ros.core.errors import AdapterError
 from csas_shadow_ros.core.shape.result import ObjectResult, Result
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 
 from .evidence import evidence_from_msg, evidence_to_msg
 from .measurements import (

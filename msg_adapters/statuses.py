@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 from csas_shadow_ros.core.errors import AdapterError
 from csas_shadow_ros.core.shape.result import LeftOut
-from csas_shadow_ros.core.volume import Target
+from csas_shadow_ros.core.shape.volume import Target
 
 from .messages import MessageFactory, check_type, frame_of, make_header, quoted, stamp_to_ns
 from .progress import Level
 from .topics import DIAGNOSTICS
 
 if TYPE_CHECKING:
-    from csas_shadow_ros.core.target import SignEvidence
+    from csas_shadow_ros.core.search.bodies import SignEvidence
 
 Value = float | int | bool | str
 
@@ -265,7 +265,9 @@ def sign_of(status: Status) -> SignEvidence | None:
     """
     if "sign" not in status:
         return None
-    from csas_shadow_ros.core.target import SignEvidence  # late: half a second for all that it searches with
+    from csas_shadow_ros.core.search.bodies import (
+        SignEvidence,  # late: half a second for all that it searches with
+    )
 
     stated = int(status.text("sign", ("1", "-1")))
     return SignEvidence(stated, *status.reals("sign_evidence", "sign_other_evidence"))

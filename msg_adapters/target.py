@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from csas_shadow_ros.core.errors import AdapterError
-from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.shape.volume import Volume
 
 from .mesh import ADD, DELETE, check_marker, colour, marker, pose
 from .messages import MessageFactory, point, xyz_of

@@ -104,6 +104,22 @@ def test_no_room_imports_itself_round_a_circle_not_even_late(modules):
     assert circle_in(edges - ALLOWED) == []
 
 
+def inner_room_of(module: str) -> str:
+    """Return the room within the core or the nodes that a module lies in; the module itself where in none."""
+    parts = module.split(".")
+    return ".".join(parts[:3]) if len(parts) > 3 else module
+
+
+def test_no_room_within_core_or_nodes_imports_itself_round_a_circle(modules):
+    inside = tuple(f"{PACKAGES[0]}.{room}." for room in ("core", "nodes"))
+    pairs = {
+        (inner_room_of(i.importer), inner_room_of(i.imported))
+        for i in imports_of(modules)
+        if i.importer.startswith(inside) and i.imported.startswith(inside)
+    }
+    assert circle_in({(a, b) for a, b in pairs if a != b}) == []
+
+
 def test_the_core_imports_nothing_but_itself(modules):
     assert {b for a, b in room_edges(modules) if a == "core"} == set()
 

@@ -106,7 +106,7 @@ def test_the_wheel_declares_a_command_for_each_node_and_the_extras(wheel):
     entries = wheel.read(f"{info}/entry_points.txt").decode()
     assert "csas-shadow = csas_shadow_ros.__main__:main" in entries
     for node in nodes():
-        assert f"{node} = csas_shadow_ros.nodes.start:{node}" in entries
+        assert f"{node} = csas_shadow_ros.nodes.runtime.start:{node}" in entries
     metadata = wheel.read(f"{info}/METADATA").decode()
     for extra in ("ros", "test", "dev"):
         assert f"Provides-Extra: {extra}" in metadata

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from csas_shadow_ros.nodes.params import parameter_table, yaml_text
+from csas_shadow_ros.nodes.runtime.params import parameter_table, yaml_text
 from msg_adapters.topics import topic_table
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -16,7 +16,7 @@ from ..bags import BagReader
 from ..bags.tracks import BagRuns
 from ..core.errors import CsasError
 from ..core.parameters import MAX_OBJECTS, PipelineParameters
-from ..process import process_bag
+from ..run_bag import process_bag
 from .layout import Archive, PartOfTask, Record, brief, jsonable
 from .rows import Rows, copy_of, rows_of
 from .sources import content_of, signature_of

@@ -18,7 +18,7 @@ from queue import SimpleQueue
 from typing import Any, Protocol, TypeVar
 
 from ..core.errors import CsasError, ParameterError
-from ..graph import THREADS_OF_LIBRARIES, environment_of
+from ..graph.processes import THREADS_OF_LIBRARIES, environment_of
 from .extras import need
 
 T = TypeVar("T")

@@ -484,7 +484,7 @@ def judge_image(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, 
 def judge_sectors(run: Run, track: Track) -> Iterator[tuple[str, str, str]]:
     """Yield (level, problem, remedy) for arcs that no sector covers, or that two say they are."""
     # Late: it needs the FFT and the compiler.
-    from csas_shadow_ros.core.streaming import uncovered
+    from csas_shadow_ros.core.sectors.streaming import uncovered
 
     total = run.sector_sum()
     if arcs := uncovered(total.arcs, track):
@@ -774,7 +774,7 @@ def judge_view(view: View, track: Track) -> Iterator[tuple[str, str, str]]:
 def check_spectrum_sign(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, str]]:
     """Yield (level, problem, remedy) if the image contradicts its stated spectrum sign."""
     # Imported here: a bag of views is checked without the weight of the whole method.
-    from csas_shadow_ros.core.target import spectrum_sign_evidence
+    from csas_shadow_ros.core.search.bodies import spectrum_sign_evidence
 
     try:
         evidence, _ = spectrum_sign_evidence(image, track)

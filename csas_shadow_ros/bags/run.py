@@ -13,7 +13,7 @@ import numpy as np
 
 from csas_shadow_ros.core.errors import BagError, CsasError, check_type
 from csas_shadow_ros.core.geometry import CoherentImage, Datum, Origin, Track, View
-from csas_shadow_ros.core.sector import Sector, unlike
+from csas_shadow_ros.core.sectors.sector import Sector, unlike
 from msg_adapters.camera_info import SectorInfo, sector_info_from_msg
 from msg_adapters.image import largest_part, quantise
 from msg_adapters.messages import SCENE_FRAME, RosbagsMessages
@@ -42,7 +42,7 @@ from .tracks import BagRuns
 
 if TYPE_CHECKING:
     from csas_shadow_ros.core.search.decision import Decision
-    from csas_shadow_ros.core.streaming import SectorSum
+    from csas_shadow_ros.core.sectors.streaming import SectorSum
 
 T = TypeVar("T")
 
@@ -171,7 +171,7 @@ class Run:
             If there are none that can be summed.
         """
         # Late: it needs the FFT and the compiler, which a player of bags need not load.
-        from csas_shadow_ros.core.streaming import SectorSum
+        from csas_shadow_ros.core.sectors.streaming import SectorSum
 
         if self._sum is None:
             total = SectorSum()
@@ -237,7 +237,7 @@ class Run:
         """Return what the bag's views were made for, as topic `search` or `target` tells; None if neither."""
         # Late: it needs the method, which readers of messages need not load.
         from csas_shadow_ros.core.search.decision import Decision
-        from csas_shadow_ros.core.volume import Target
+        from csas_shadow_ros.core.shape.volume import Target
         from msg_adapters.search import decision_from_msg
         from msg_adapters.target import target_from_msg
 

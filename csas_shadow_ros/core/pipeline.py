@@ -16,17 +16,17 @@ from typing import Any
 from .errors import ViewError, check_range
 from .geometry import CoherentImage, Track, View
 from .geometry.passage import passage
-from .hollows import EchoLook
-from .likelihood import Levels, outside_likelihood, view_levels
-from .measurement import SilhouetteSides, silhouette_sides
+from .imaging.enhancement import enhance
+from .imaging.likelihood import Levels, outside_likelihood, view_levels
+from .imaging.segmentation import segment_shadow
+from .imaging.subaperture import Spectrum, SubApertures
 from .parameters import MAX_OBJECTS, MOST_OBJECTS, PipelineParameters
 from .reconstruction import Reconstruction
 from .search.decision import Decision, decide_by_image
-from .segmentation import segment_shadow
-from .shadow import enhance
+from .shape.hollows import EchoLook
+from .shape.measurement import SilhouetteSides, silhouette_sides
 from .shape.result import Result
-from .subaperture import Spectrum, SubApertures
-from .volume import Target
+from .shape.volume import Target
 
 
 class ProcessedView:

@@ -18,24 +18,30 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .arcs import Arc, Arcs
-from .carving import Carver
-from .composites import Composites
 from .errors import ViewError
 from .geometry import SCENE_FRAME, View, ViewInfo
-from .hollows import EchoLook, matter_mesh, matter_of
-from .likelihood import Levels
-from .masks import MASK_SHADOW, KeptMask
-from .measurement import SilhouetteSides, levels_of_mask, measure_object, shadow_height, silhouette_sides
-from .mesh import Dimensions, measure, mesh_from_grid
+from .geometry.arcs import Arc, Arcs
+from .imaging.composites import Composites
+from .imaging.likelihood import Levels
+from .imaging.masks import MASK_SHADOW, KeptMask
+from .imaging.segmentation import require_silhouette
 from .parameters import PipelineParameters
 from .search.decision import Decision
-from .segmentation import require_silhouette
-from .shape.pieces import NOTHING_LEFT, objects_of
+from .search.pieces import NOTHING_LEFT, objects_of
+from .shape.carving import Carver
+from .shape.hollows import EchoLook, matter_mesh, matter_of
+from .shape.measurement import (
+    SilhouetteSides,
+    levels_of_mask,
+    measure_object,
+    shadow_height,
+    silhouette_sides,
+)
+from .shape.mesh import Dimensions, measure, mesh_from_grid
 from .shape.result import LeftOut, ObjectResult, Result, ViewEvidence
 from .shape.verdict import judge
+from .shape.volume import Target, VoxelGrid
 from .threads import in_order
-from .volume import Target, VoxelGrid
 
 if TYPE_CHECKING:
     import trimesh

@@ -20,7 +20,7 @@ import scipy.ndimage
 from numpy.typing import NDArray
 
 from .geometry import CoherentImage, ShadowCamera, View, ViewInfo, down_range_axis, unit_to_sonar
-from .volume import Volume
+from .shape.volume import Volume
 
 #: Values of a silhouette: lit seabed; between the target's echo and its shadow; not known; target's shadow.
 OUTSIDE, COVERED, UNKNOWN, SHADOW = 0, 64, 128, 255

@@ -72,7 +72,7 @@ def _sample(**given: View) -> ProcessedView:
     """Begin with a stage of the sample view."""
     from .parameters import PipelineParameters
     from .pipeline import ProcessedView
-    from .volume import Target
+    from .shape.volume import Target
 
     return ProcessedView(Target(_TARGET_M, (0.6, 0.6, 0.3)), PipelineParameters(), **given)
 
@@ -93,12 +93,12 @@ def warm_likelihood() -> None:
 
 def warm_carving(parameters: CarvingParameters | None = None) -> None:
     """Carve a few voxels with a sample view by a method, and look at them as at the end of a run."""
-    from .carving import Carver
-    from .explained import count_shadow_pixels
-    from .hollows import matter_of
-    from .measurement import levels_of_mask, silhouette_sides
-    from .mesh import measure, mesh_from_grid
-    from .volume import Volume
+    from .shape.carving import Carver
+    from .shape.explained import count_shadow_pixels
+    from .shape.hollows import matter_of
+    from .shape.measurement import levels_of_mask, silhouette_sides
+    from .shape.mesh import measure, mesh_from_grid
+    from .shape.volume import Volume
 
     p = parameters or CarvingParameters()
     shadow = _shadow_view()
@@ -130,9 +130,9 @@ def warm_carving(parameters: CarvingParameters | None = None) -> None:
 
 def warm_sub_apertures() -> None:
     """Sum two small sectors, and make a view of the sum."""
-    from .sector import Sector
-    from .streaming import SectorSum
-    from .subaperture import SubApertures
+    from .imaging.subaperture import SubApertures
+    from .sectors.sector import Sector
+    from .sectors.streaming import SectorSum
 
     theta = np.linspace(0.0, 2.0 * math.pi, 180, endpoint=False)
     circle = np.column_stack([20.0 * np.cos(theta), 20.0 * np.sin(theta), np.full(theta.size, 6.0)])
@@ -153,7 +153,7 @@ def warm_sub_apertures() -> None:
 
 def warm_composites() -> None:
     """Add a sample view to the images of the circle."""
-    from .composites import Composites
+    from .imaging.composites import Composites
 
     for view in _both(sample_view()):
         Composites.for_view(view).integrate(view)

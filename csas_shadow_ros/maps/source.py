@@ -19,13 +19,13 @@ from msg_adapters.pairs import ground_picture_from_msgs, view_from_msgs
 
 from ..archive.rows import datum_of, rows_of_report
 from ..bags import BagReader, iterate_pairs
-from ..core.composites import Composites
 from ..core.errors import CsasError, ParameterError
 from ..core.geometry import Datum, GroundGrid, View, ViewInfo
-from ..core.mesh import Dimensions
+from ..core.imaging.composites import Composites
 from ..core.parameters import PlaceParameters
+from ..core.shape.mesh import Dimensions
 from ..core.shape.result import Quality, Result
-from ..core.volume import Volume, VoxelGrid
+from ..core.shape.volume import Volume, VoxelGrid
 from ..results import read_report
 from ..results.bag import ResultBag
 

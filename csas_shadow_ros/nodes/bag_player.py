@@ -13,8 +13,8 @@ from csas_shadow_ros.core.errors import BagError, CsasError, ParameterError
 from msg_adapters import coherent_image_from_msgs, stamp_from_ns, track_to_msg
 
 from . import qos
-from .base import CsasNode, Source, run_node
 from .playing import BagViews, schedule, stage_of_bag
+from .runtime.base import CsasNode, Source, run_node
 
 
 class BagPlayerNode(CsasNode):

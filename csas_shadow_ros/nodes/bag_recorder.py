@@ -22,8 +22,8 @@ from msg_adapters.topics import RESULT_TOPICS, absolute_name, is_latched, is_top
 from msg_adapters.topics import topic as topic_of
 
 from . import qos
-from .base import INTEGRATED, CsasNode, Inlet, run_node
 from .playing import message_stamp, recorded_streams, topics_to_record
+from .runtime.base import INTEGRATED, CsasNode, Inlet, run_node
 from .runtime.runs import HOLD_S
 
 #: Topics of messages that differ though they carry the same stamp.

@@ -8,16 +8,16 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from csas_shadow_ros.core.composites import Composites
 from csas_shadow_ros.core.errors import ViewError
 from csas_shadow_ros.core.geometry import Acoustics
+from csas_shadow_ros.core.imaging.composites import Composites
 from csas_shadow_ros.core.warm import warm_composites
 from msg_adapters import GroundInfo, Heartbeat, ground_picture_to_msgs, view_from_msgs
 from msg_adapters.topics import stream as stream_of
 
 from . import qos
-from .base import INTEGRATED, CsasNode, Inlet, run_node
-from .growing import Growing
+from .runtime.base import INTEGRATED, CsasNode, Inlet, run_node
+from .runtime.pace import Growing
 from .runtime.runs import RunFollower
 
 _PICTURES = ("multilook", "color_by_aspect")

@@ -5,16 +5,16 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from csas_shadow_ros.core.display import decibel_picture
 from csas_shadow_ros.core.errors import NoTargetError
+from csas_shadow_ros.core.imaging.display import decibel_picture
 from csas_shadow_ros.core.parameters import PipelineParameters, ShadowParameters
 from csas_shadow_ros.core.pipeline import ProcessedView
 from csas_shadow_ros.core.warm import warm_enhancement
 from msg_adapters import display_to_msg, view_from_msgs
 
 from . import qos
-from .base import PUBLISHED, CsasNode, Inlet, TargetInlet, ViewOutlet, run_node
-from .params import part
+from .runtime.base import PUBLISHED, CsasNode, Inlet, TargetInlet, ViewOutlet, run_node
+from .runtime.params import part
 
 
 class ShadowEnhancementNode(CsasNode):

@@ -10,8 +10,8 @@ from csas_shadow_ros.core.pipeline import ProcessedView
 from csas_shadow_ros.core.warm import warm_likelihood
 from msg_adapters import view_from_msgs
 
-from .base import PUBLISHED, CsasNode, Inlet, TargetInlet, ViewOutlet, run_node
-from .params import part
+from .runtime.base import PUBLISHED, CsasNode, Inlet, TargetInlet, ViewOutlet, run_node
+from .runtime.params import part
 
 
 class ShadowLikelihoodNode(CsasNode):

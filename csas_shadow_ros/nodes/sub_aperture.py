@@ -17,10 +17,10 @@ from typing import Any
 from csas_shadow_ros.bags.check import ERROR, judge_band, judge_coverage, judge_geometry, judge_image
 from csas_shadow_ros.core.errors import CsasError, TrackError, ViewError
 from csas_shadow_ros.core.geometry import CoherentImage, Track
+from csas_shadow_ros.core.imaging.subaperture import SubApertures
 from csas_shadow_ros.core.parameters import SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.search.decision import Decision
-from csas_shadow_ros.core.streaming import Stream
-from csas_shadow_ros.core.subaperture import SubApertures
+from csas_shadow_ros.core.sectors.streaming import Stream
 from csas_shadow_ros.core.warm import warm_sub_apertures
 from msg_adapters import (
     TOPICS,
@@ -39,8 +39,8 @@ from msg_adapters import (
 )
 
 from . import qos
-from .base import INTEGRATED, CsasNode, Inlet, Source, run_node
-from .params import part
+from .runtime.base import INTEGRATED, CsasNode, Inlet, Source, run_node
+from .runtime.params import part
 from .runtime.runs import HOLD_S, RunFollower
 
 #: Counts of a stream that somebody should hear of, and what they mean.

@@ -46,8 +46,8 @@ from msg_adapters import (
 from msg_adapters.topics import stream as stream_of
 
 from . import qos
-from .base import INTEGRATED, CsasNode, Inlet, run_node
-from .flow import place_of
+from .runtime.base import INTEGRATED, CsasNode, Inlet, run_node
+from .runtime.flow import place_of
 from .runtime.runs import RunFollower
 
 #: Messages that wait to be shown; newer ones are dropped, and caught up with at the end of the run.

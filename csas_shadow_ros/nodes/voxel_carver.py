@@ -27,9 +27,9 @@ from msg_adapters.measurements import numbered_objects
 from msg_adapters.topics import OTHER_METHOD, PREFIXED_TOPICS, RESULT_TOPICS, object_prefix, prefixed
 
 from . import qos
-from .base import INTEGRATED, CsasNode, Inlet, TargetInlet, run_node
-from .growing import Growing
-from .params import part
+from .runtime.base import INTEGRATED, CsasNode, Inlet, TargetInlet, run_node
+from .runtime.pace import Growing
+from .runtime.params import part
 from .runtime.place import PlaceOnEarth
 from .runtime.runs import RunFollower
 

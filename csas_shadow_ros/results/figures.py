@@ -31,12 +31,12 @@ from ..core.geometry import (
     View,
     unit_to_sonar,
 )
-from ..core.masks import MASK_COVERED, MASK_SHADOW, MASK_UNKNOWN
-from ..core.mesh import surface_field
-from ..core.shadow import enhance
+from ..core.imaging.enhancement import enhance
+from ..core.imaging.masks import MASK_COVERED, MASK_SHADOW, MASK_UNKNOWN
+from ..core.imaging.subaperture import Spectrum, SubApertures
+from ..core.shape.mesh import surface_field
 from ..core.shape.picture import view_extent
-from ..core.subaperture import Spectrum, SubApertures
-from ..core.volume import VoxelGrid
+from ..core.shape.volume import VoxelGrid
 from .subject import SIX_ASPECTS_DEG, ProcessedView, Subject
 
 #: Levels shown, dB over the median.

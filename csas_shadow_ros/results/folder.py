@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from ..bags import BagReader
 from ..core.errors import CsasError
 from ..core.geometry import CoherentImage, Track, View
-from ..core.mesh import Dimensions, measure, mesh_from_grid
 from ..core.pipeline import ProcessedView
+from ..core.shape.mesh import Dimensions, measure, mesh_from_grid
 from ..core.shape.result import Result
-from ..core.volume import Volume, VoxelGrid
+from ..core.shape.volume import Volume, VoxelGrid
 from ..durable import BY_HAND, CHECKSUMS, Place, write_checksums
 from .bag import ResultBag
 from .report import FORMAT, Context, build_report, complete_report, report_text, summary

@@ -29,7 +29,7 @@ from .folder import ResultsWriter
 from .subject import SIX_ASPECTS_DEG
 
 if TYPE_CHECKING:
-    from ..replay import ReplayResult
+    from ..graph.replay import ReplayResult
 
 #: Stages of the views that figures show.
 _STAGES = ("sub_aperture", "shadow", "likelihood", "shadow_mask")

@@ -20,12 +20,12 @@ import numpy as np
 
 from .. import __version__
 from ..core.geometry import CoherentImage, Place, Track
-from ..core.mesh import Dimensions
 from ..core.parameters import CarvingParameters, PipelineParameters
+from ..core.shape.mesh import Dimensions
 from ..core.shape.result import Result, ViewEvidence
+from ..core.shape.threshold import thresholded
 from ..core.shape.verdict import explained_share, no_object_reason
-from ..core.threshold import thresholded
-from ..core.volume import VoxelGrid
+from ..core.shape.volume import VoxelGrid
 from .truth import KnownTruth, TruthError, read_truth
 
 FORMAT = "csas_shadow_ros results 1"

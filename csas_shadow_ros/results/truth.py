@@ -17,9 +17,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ..core.errors import CsasError
-from ..core.mesh import Dimensions, measure
-from ..core.solid import judge_solid, open_edges
-from ..core.volume import Volume, VoxelGrid
+from ..core.shape.mesh import Dimensions, measure
+from ..core.shape.solid import judge_solid, open_edges
+from ..core.shape.volume import Volume, VoxelGrid
 
 if TYPE_CHECKING:
     import trimesh
@@ -219,7 +219,7 @@ def of_objects(
     Examples
     --------
     >>> import trimesh
-    >>> from csas_shadow_ros.core.mesh import measure
+    >>> from csas_shadow_ros.core.shape.mesh import measure
     >>> boxes = [trimesh.creation.box((0.8, 0.4, 0.4)), trimesh.creation.box((0.5, 0.4, 0.4))]
     >>> _ = boxes[1].apply_translation((1.5, 0.0, 0.0))
     >>> scene = KnownTruth(Path("bag.truth.stl"), trimesh.util.concatenate(boxes))

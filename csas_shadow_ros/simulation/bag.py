@@ -9,7 +9,7 @@ from typing import Any
 
 from ..core.errors import check_type
 from ..core.geometry import Datum
-from ..core.sector import Sector
+from ..core.sectors.sector import Sector
 from .run import SimulatedRun, simulate
 from .sectors import sectors_of_run
 

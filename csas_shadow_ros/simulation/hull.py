@@ -12,8 +12,8 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import GeometryError, check_range
-from ..core.solid import judge_solid, open_edges
-from ..core.volume import Volume
+from ..core.shape.solid import judge_solid, open_edges
+from ..core.shape.volume import Volume
 from .raster import add_windings, fill_triangles, keep_shadowed
 from .scene import project_shadow
 

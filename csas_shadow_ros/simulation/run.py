@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import ParameterError, check_range
 from ..core.geometry import SCENE_FRAME, TWO_PI, Acoustics, CoherentImage, Track
-from ..core.solid import apart
+from ..core.shape.solid import apart
 from ..progress import ProgressOption, progress_bar
 from .profiles import Faults, Profile, get_profile
 from .scene import SceneModel

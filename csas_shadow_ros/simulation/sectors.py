@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import ParameterError, TrackError, check_range
 from ..core.geometry import TWO_PI, CoherentImage, Track, unit_to_sonar
-from ..core.sector import Sector
+from ..core.sectors.sector import Sector
 
 
 def sectors_of_run(image: CoherentImage, track: Track, width_deg: float) -> Iterator[tuple[Sector, int]]:

@@ -17,7 +17,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from ..core.errors import GeometryError, ParameterError, check_type
-from ..core.solid import judge_solid
+from ..core.shape.solid import judge_solid
 
 FloatArray = NDArray[np.float64]
 

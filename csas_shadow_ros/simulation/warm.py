@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..core.volume import Volume
+from ..core.shape.volume import Volume
 from .hull import shadow_hull, voxelise_truth
 from .occlusion import plain_tracer
 from .targets import box

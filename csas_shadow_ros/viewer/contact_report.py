@@ -26,8 +26,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from .. import __version__
-from ..core.masks import MASK_SHADOW
-from ..core.mesh import mesh_from_grid
+from ..core.imaging.masks import MASK_SHADOW
+from ..core.shape.mesh import mesh_from_grid
 from .crop import HIGH_SHOWN_DB as _HIGH
 from .crop import LOW_SHOWN_DB as _LOW
 from .crop import Window, cast, contact_named, grey_of, outlines, shadow_m

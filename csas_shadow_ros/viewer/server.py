@@ -21,9 +21,9 @@ from urllib.parse import quote
 from aiohttp import WSMsgType, web
 
 from ..core.errors import CsasError, ParameterError
-from ..core.mesh import measure, mesh_from_grid
 from ..core.parameters import CarvingParameters
-from ..core.threshold import thresholded
+from ..core.shape.mesh import measure, mesh_from_grid
+from ..core.shape.threshold import thresholded
 from .store import ViewerError, ViewStore
 
 STATIC = Path(__file__).parent / "static"

@@ -29,13 +29,13 @@ from ..bags.index import BagIndex
 from ..bags.run import checked_messages
 from ..core.errors import BagError, CsasError
 from ..core.geometry import CoherentImage, Track, View
+from ..core.imaging.subaperture import SubApertures
 from ..core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
 from ..core.pipeline import ProcessedView
 from ..core.reconstruction import Reconstruction
 from ..core.search.decision import Decision
-from ..core.subaperture import SubApertures
-from ..core.threshold import thresholded
-from ..core.volume import Target, Volume, VoxelGrid
+from ..core.shape.threshold import thresholded
+from ..core.shape.volume import Target, Volume, VoxelGrid
 from . import codes
 from .contacts import about, contacts_of
 from .desk import Desk

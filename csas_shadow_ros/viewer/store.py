@@ -22,9 +22,9 @@ from msg_adapters.camera_info import GroundInfo
 
 from ..core.errors import CsasError
 from ..core.geometry import Track, ViewInfo
-from ..core.mesh import Dimensions
-from ..core.threshold import needed_threshold
-from ..core.volume import VoxelGrid
+from ..core.shape.mesh import Dimensions
+from ..core.shape.threshold import needed_threshold
+from ..core.shape.volume import VoxelGrid
 from . import codes
 from .codes import LOW_DB, STEP_DB, Codes
 

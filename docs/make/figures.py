@@ -21,11 +21,11 @@ from PIL import Image
 
 import csas_shadow_ros as csas
 from csas_shadow_ros.core.geometry import GroundGrid
-from csas_shadow_ros.core.likelihood import l_out
+from csas_shadow_ros.core.imaging.likelihood import l_out
+from csas_shadow_ros.core.imaging.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.core.pipeline import process
 from csas_shadow_ros.core.reconstruction import Reconstruction
 from csas_shadow_ros.core.search.decision import decide_by_image
-from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.results.figures import decibels, north_up
 
 ROOT = Path(__file__).resolve().parents[2]

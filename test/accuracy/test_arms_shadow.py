@@ -14,9 +14,9 @@ import pytest
 import scipy.ndimage
 
 from csas_shadow_ros.core.geometry import ShadowCamera, View
+from csas_shadow_ros.core.imaging.enhancement import enhance
+from csas_shadow_ros.core.imaging.subaperture import SubApertures
 from csas_shadow_ros.core.parameters import ShadowParameters, SubApertureParameters
-from csas_shadow_ros.core.shadow import enhance
-from csas_shadow_ros.core.subaperture import SubApertures
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.raster import fill_triangles
 

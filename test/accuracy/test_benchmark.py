@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 from csas_shadow_ros.simulation import shadow_hull, simulate, voxelise_truth
 
 ROOT = Path(__file__).resolve().parents[2]

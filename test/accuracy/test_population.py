@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from csas_shadow_ros.core.mesh import Dimensions, measure
-from csas_shadow_ros.core.volume import VoxelGrid
+from csas_shadow_ros.core.shape.mesh import Dimensions, measure
+from csas_shadow_ros.core.shape.volume import VoxelGrid
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 

@@ -17,7 +17,7 @@ from csas_shadow_ros.core.geometry import (
     ViewInfo,
     view_ground_to_pixel,
 )
-from csas_shadow_ros.core.sector import Sector
+from csas_shadow_ros.core.sectors.sector import Sector
 from msg_adapters import RclpyMessages, RosbagsMessages
 
 ACOUSTICS = Acoustics(120e3, 40e3, 1500.0, -1)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from csas_shadow_ros.core.geometry import Acoustics, GroundGrid, ShadowCamera, ViewInfo, view_ground_to_pixel
-from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.shape.volume import Volume
 from msg_adapters import (
     AdapterError,
     GroundInfo,

@@ -11,7 +11,7 @@ import pytest
 from csas_shadow_ros.core.geometry import Datum, Origin
 from csas_shadow_ros.core.search.decision import Decision
 from csas_shadow_ros.core.shape.result import Result
-from csas_shadow_ros.core.volume import Target
+from csas_shadow_ros.core.shape.volume import Target
 from msg_adapters import (
     AdapterError,
     coherent_image_from_msgs,

@@ -11,7 +11,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 from msg_adapters import (
     AdapterError,
     Heartbeat,

@@ -10,13 +10,13 @@ import pytest
 import trimesh
 
 from csas_shadow_ros.bags import BagReader
-from csas_shadow_ros.core.mesh import Dimensions, measure, mesh_from_grid
 from csas_shadow_ros.core.pipeline import Result as PipelineResult
-from csas_shadow_ros.core.seabed import SeabedSlope
+from csas_shadow_ros.core.search.bodies import SignEvidence
 from csas_shadow_ros.core.search.decision import Decision
+from csas_shadow_ros.core.shape.mesh import Dimensions, measure, mesh_from_grid
 from csas_shadow_ros.core.shape.result import LeftOut, ObjectResult, Quality, Result, ViewEvidence
-from csas_shadow_ros.core.target import SignEvidence
-from csas_shadow_ros.core.volume import Target, Volume, VoxelGrid
+from csas_shadow_ros.core.shape.seabed import SeabedSlope
+from csas_shadow_ros.core.shape.volume import Target, Volume, VoxelGrid
 from csas_shadow_ros.results.bag import ResultBag
 from msg_adapters import (
     AdapterError,

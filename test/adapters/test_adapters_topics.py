@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.shape.volume import Volume
 from msg_adapters import (
     LATCHED,
     STREAMS,

@@ -31,8 +31,8 @@ from csas_shadow_ros.core.geometry import (
     ViewInfo,
     view_ground_to_pixel,
 )
-from csas_shadow_ros.core.target import SignEvidence
-from csas_shadow_ros.process import refuse_contradictions
+from csas_shadow_ros.core.search.bodies import SignEvidence
+from csas_shadow_ros.run_bag import refuse_contradictions
 from msg_adapters import RosbagsMessages, coherent_image_to_msgs, track_to_msg, view_to_msgs
 
 START_NS = 1_700_000_000_000_000_000
@@ -354,7 +354,8 @@ def test_a_track_over_the_image_or_beside_it_is_an_error():
     ],
 )
 def test_evidence_for_the_spectrum_sign_becomes_a_finding(monkeypatch, evidence, level, text):
-    monkeypatch.setattr("csas_shadow_ros.core.target.spectrum_sign_evidence", lambda i, t: (evidence, None))
+    asked = "csas_shadow_ros.core.search.bodies.spectrum_sign_evidence"
+    monkeypatch.setattr(asked, lambda i, t: (evidence, None))
     ((found, problem, remedy),) = check_spectrum_sign(annulus_image(), circle())
     assert found == level
     assert text in problem
@@ -365,7 +366,7 @@ def test_a_spectrum_sign_that_cannot_be_checked_is_a_warning(monkeypatch):
     def fail(image, track):
         raise ViewError("no aspect is covered")
 
-    monkeypatch.setattr("csas_shadow_ros.core.target.spectrum_sign_evidence", fail)
+    monkeypatch.setattr("csas_shadow_ros.core.search.bodies.spectrum_sign_evidence", fail)
     ((level, problem, _),) = check_spectrum_sign(annulus_image(), circle())
     assert (level, problem) == ("warning", "the spectrum sign cannot be checked: no aspect is covered")
 

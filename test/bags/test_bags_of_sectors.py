@@ -13,9 +13,9 @@ from csas_shadow_ros.bags import BagReader, check_bag, read_run, write_run
 from csas_shadow_ros.cli import main
 from csas_shadow_ros.core.geometry import GroundGrid, Track
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
-from csas_shadow_ros.core.sector import Sector
+from csas_shadow_ros.core.sectors.sector import Sector
 from csas_shadow_ros.nodes.playing import BagViews
-from csas_shadow_ros.process import replay_bag
+from csas_shadow_ros.run_bag import replay_bag
 from csas_shadow_ros.simulation.sectors import sectors_of_run
 from msg_adapters import RosbagsMessages
 from msg_adapters.pairs import coherent_image_to_msgs

@@ -28,7 +28,7 @@ from csas_shadow_ros.core.geometry import (
     ViewInfo,
     view_ground_to_pixel,
 )
-from csas_shadow_ros.core.sector import Sector, image_from_sectors
+from csas_shadow_ros.core.sectors.sector import Sector, image_from_sectors
 from msg_adapters import RosbagsMessages, coherent_image_to_msgs, track_to_msg, view_to_msgs
 from msg_adapters.messages import typestore
 

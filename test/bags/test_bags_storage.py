@@ -23,7 +23,7 @@ from csas_shadow_ros.bags.index import BagIndex
 from csas_shadow_ros.bags.metadata import read_metadata
 from csas_shadow_ros.core.errors import BagError
 from csas_shadow_ros.nodes.playing import BagViews, stage_of_bag
-from csas_shadow_ros.process import describe_run
+from csas_shadow_ros.run_bag import describe_run
 from msg_adapters.messages import typestore
 
 VIEWS = 12

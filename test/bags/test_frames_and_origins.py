@@ -12,12 +12,12 @@ from csas_shadow_ros.bags import check_bag, read_run, write_run
 from csas_shadow_ros.cli import main
 from csas_shadow_ros.core.errors import BagError, GeometryError, TrackError, ViewError
 from csas_shadow_ros.core.geometry import Datum, Origin, Track, TrackBook, TrackPiece
+from csas_shadow_ros.core.imaging.subaperture import SubApertures
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.pipeline import process
 from csas_shadow_ros.core.reconstruction import Reconstruction
 from csas_shadow_ros.core.search.decision import Decision
-from csas_shadow_ros.core.subaperture import SubApertures
-from csas_shadow_ros.core.volume import Target
+from csas_shadow_ros.core.shape.volume import Target
 from csas_shadow_ros.from_bag import reconstruct_run
 from msg_adapters import RosbagsMessages, origin_to_msg, view_to_msgs
 

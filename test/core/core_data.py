@@ -19,8 +19,8 @@ from csas_shadow_ros.core.geometry import (
     ViewInfo,
     view_ground_to_pixel,
 )
+from csas_shadow_ros.core.imaging.subaperture import SubApertures
 from csas_shadow_ros.core.parameters import SubApertureParameters
-from csas_shadow_ros.core.subaperture import SubApertures
 
 RADIUS_M, HEIGHT_M = 30.0, 12.0
 #: Band 374 … 560 rad/m on the ground; a pixel of 5 mm holds 628 rad/m.

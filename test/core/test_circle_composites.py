@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from core_data import ground_of_pixels, make_info
 
-from csas_shadow_ros.core.composites import Composites, level_image
 from csas_shadow_ros.core.errors import ParameterError
 from csas_shadow_ros.core.geometry import GroundGrid, View, wrap_angle
+from csas_shadow_ros.core.imaging.composites import Composites, level_image
 
 GRID = GroundGrid.centred(90, 110, 0.02, (0.1, -0.05))
 

@@ -10,9 +10,9 @@ import pytest
 import trimesh
 from core_data import HEIGHT_M, RADIUS_M, make_info
 
-from csas_shadow_ros.core.contour import Contour, contour_height, contour_of
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.pipeline import run
+from csas_shadow_ros.core.shape.contour import Contour, contour_height, contour_of
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.profiles import Profile
 

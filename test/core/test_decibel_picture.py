@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from csas_shadow_ros.core.display import HIGHEST_DB, LOWEST_DB, decibel_picture
+from csas_shadow_ros.core.imaging.display import HIGHEST_DB, LOWEST_DB, decibel_picture
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])

@@ -10,16 +10,22 @@ import pytest
 import trimesh
 from core_data import ground_of_pixels, hidden_by_box, iou, make_info
 
-from csas_shadow_ros.core.carving import Carver, carve
-from csas_shadow_ros.core.echo import layover_per_metre
-from csas_shadow_ros.core.explained import cast_shadow, shadow_fit, unexplained_shadow
 from csas_shadow_ros.core.geometry import View
-from csas_shadow_ros.core.masks import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, near_covered
+from csas_shadow_ros.core.imaging.masks import (
+    MASK_COVERED,
+    MASK_OUTSIDE,
+    MASK_SHADOW,
+    MASK_UNKNOWN,
+    near_covered,
+)
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.pipeline import run
+from csas_shadow_ros.core.shape.carving import Carver, carve
+from csas_shadow_ros.core.shape.explained import cast_shadow, shadow_fit, unexplained_shadow
+from csas_shadow_ros.core.shape.layover import layover_per_metre
 from csas_shadow_ros.core.shape.result import Result, ViewEvidence
 from csas_shadow_ros.core.shape.verdict import explained_share, judge
-from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.shape.volume import Volume
 from csas_shadow_ros.simulation import shadow_hull, simulate, voxelise_truth
 
 #: Six times as long as high: its shadow is half as long as its top.

@@ -11,12 +11,12 @@ import pytest
 
 from csas_shadow_ros.core import pipeline
 from csas_shadow_ros.core.geometry import Acoustics, ShadowCamera, ViewInfo
-from csas_shadow_ros.core.hollows import EchoLook, matter_mesh, matter_of
-from csas_shadow_ros.core.likelihood import Levels
-from csas_shadow_ros.core.local_means import ECHO_CELLS, LocalMeans
+from csas_shadow_ros.core.imaging.likelihood import Levels
+from csas_shadow_ros.core.imaging.local_means import ECHO_CELLS, LocalMeans
+from csas_shadow_ros.core.later_stages import run_views
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters, TargetParameters
-from csas_shadow_ros.core.stages import run_views
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.shape.hollows import EchoLook, matter_mesh, matter_of
+from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 from csas_shadow_ros.simulation import iou, simulate, voxelise_truth
 
 VIEWS = 48

@@ -20,7 +20,7 @@ import json, tempfile
 {patch}
 from csas_shadow_ros.core import kernels
 import numpy as np
-from csas_shadow_ros.core.composites import _power_of_parts as one
+from csas_shadow_ros.core.imaging.composites import _power_of_parts as one
 out = np.empty((2, 2), np.float32)
 one(np.ones((2, 4), np.float32), out)
 assert (out == 2.0).all()

@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from csas_shadow_ros.core.local_means import LocalMeans
+from csas_shadow_ros.core.imaging.local_means import LocalMeans
 
 
 def box_by_box(power: np.ndarray, known: np.ndarray, radius: tuple[int, int]) -> np.ndarray:

@@ -19,7 +19,9 @@ from core_data import (
     perfect_views,
 )
 
-from csas_shadow_ros.core.carving import (
+from csas_shadow_ros.core.geometry import Acoustics, View
+from csas_shadow_ros.core.parameters import CarvingParameters
+from csas_shadow_ros.core.shape.carving import (
     MASK_COVERED,
     MASK_OUTSIDE,
     MASK_SHADOW,
@@ -27,9 +29,8 @@ from csas_shadow_ros.core.carving import (
     Carver,
     carve,
 )
-from csas_shadow_ros.core.echo import echo_zone, opaque_part
-from csas_shadow_ros.core.geometry import Acoustics, View
-from csas_shadow_ros.core.measurement import (
+from csas_shadow_ros.core.shape.layover import echo_zone, opaque_part
+from csas_shadow_ros.core.shape.measurement import (
     SHAPES,
     PlanFit,
     SilhouetteSides,
@@ -40,9 +41,8 @@ from csas_shadow_ros.core.measurement import (
     silhouette_sides,
     upright_height,
 )
-from csas_shadow_ros.core.mesh import mesh_from_grid
-from csas_shadow_ros.core.parameters import CarvingParameters
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.shape.mesh import mesh_from_grid
+from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 
 GRAZING = math.atan2(HEIGHT_M, RADIUS_M)
 INFOS = tuple(make_info(math.radians(a), size=256, spacing_m=0.012) for a in range(0, 360, 4))
@@ -455,7 +455,7 @@ def test_a_voxel_that_few_views_know_is_object_only_on_top_of_object():
     views[3:5] = 8  # a high top, whose shadow leaves the image in most views
     likelihood[5, 0, 0] = 0.0
     views[5, 0, 0] = 8  # a phantom roof
-    from csas_shadow_ros.core.threshold import thresholded
+    from csas_shadow_ros.core.shape.threshold import thresholded
 
     volume = Volume.around((0, 0), (0.9, 0.9, 0.6), 0.1)
     grid = thresholded(volume, likelihood, views, CarvingParameters(threshold=0.03))

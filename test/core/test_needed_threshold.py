@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.ndimage
 
-from csas_shadow_ros.core.threshold import needed_threshold, occupied_voxels
+from csas_shadow_ros.core.shape.threshold import needed_threshold, occupied_voxels
 
 
 @pytest.mark.parametrize("method", ["consensus", "hard", "soft"])

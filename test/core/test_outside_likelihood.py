@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from csas_shadow_ros.core.errors import ViewError
-from csas_shadow_ros.core.likelihood import (
+from csas_shadow_ros.core.imaging.enhancement import enhance
+from csas_shadow_ros.core.imaging.likelihood import (
     echo_mask,
     expected_l_out,
     l_out,
@@ -19,10 +20,9 @@ from csas_shadow_ros.core.likelihood import (
     seabed_level,
     view_levels,
 )
-from csas_shadow_ros.core.local_means import LocalMeans
+from csas_shadow_ros.core.imaging.local_means import LocalMeans
+from csas_shadow_ros.core.imaging.subaperture import SubApertures
 from csas_shadow_ros.core.parameters import LikelihoodParameters, ShadowParameters, SubApertureParameters
-from csas_shadow_ros.core.shadow import enhance
-from csas_shadow_ros.core.subaperture import SubApertures
 
 SIZE = 384
 

@@ -9,8 +9,8 @@ import pytest
 
 from csas_shadow_ros.core.errors import ParameterError
 from csas_shadow_ros.core.geometry import Datum, Origin, origin_of
-from csas_shadow_ros.core.mesh import Dimensions
 from csas_shadow_ros.core.parameters import PlaceParameters
+from csas_shadow_ros.core.shape.mesh import Dimensions
 
 PLACES = [(48.3829, -4.4953), (-33.86, 151.21), (0.0, 0.0), (69.65, 18.96), (-77.8, -179.9999), (89.9, 40.0)]
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from csas_shadow_ros.core import pipeline
-from csas_shadow_ros.core.carving import Carver
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.pipeline import ProcessedView
 from csas_shadow_ros.core.reconstruction import Reconstruction
 from csas_shadow_ros.core.search.decision import Decision
+from csas_shadow_ros.core.shape.carving import Carver
 from csas_shadow_ros.core.shape.verdict import cut_sides
-from csas_shadow_ros.core.volume import Target
+from csas_shadow_ros.core.shape.volume import Target
 
 COARSE = PipelineParameters(
     sub_aperture=SubApertureParameters(step_deg=10.0), carving=CarvingParameters(voxel_size_m=0.03)

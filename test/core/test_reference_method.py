@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from core_data import hidden_by_box, hidden_by_cylinder, make_info, make_view, perfect_views
 
-from csas_shadow_ros.core import likelihood, reference, segmentation
-from csas_shadow_ros.core.carving import Carver, carve
+from csas_shadow_ros.core import reference
 from csas_shadow_ros.core.geometry import View
+from csas_shadow_ros.core.imaging import likelihood, segmentation
 from csas_shadow_ros.core.parameters import CarvingParameters, LikelihoodParameters
-from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.shape.carving import Carver, carve
+from csas_shadow_ros.core.shape.volume import Volume
 
 #: Carving accumulates in such steps: a value is off by half of one, and a little for single precision.
 STEP = 1 / 4096

@@ -11,12 +11,12 @@ from core_data import make_info
 from hypothesis import given
 from hypothesis import strategies as st
 
-from csas_shadow_ros.core.carving import Carver
 from csas_shadow_ros.core.geometry import Track, View, down_range_axis
-from csas_shadow_ros.core.masks import MASK_SHADOW, MASK_UNKNOWN
+from csas_shadow_ros.core.imaging.masks import MASK_SHADOW, MASK_UNKNOWN
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.pipeline import run
-from csas_shadow_ros.core.seabed import SeabedSlope, ShadowEnd, seabed_slope, shadow_end
+from csas_shadow_ros.core.shape.carving import Carver
+from csas_shadow_ros.core.shape.seabed import SeabedSlope, ShadowEnd, seabed_slope, shadow_end
 
 RANGE_M, HEIGHT_M, TOP_M = 20.0, 6.0, 0.4
 STEP_DEG = 3.0

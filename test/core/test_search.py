@@ -8,14 +8,14 @@ import pytest
 import trimesh
 
 from csas_shadow_ros.core.errors import SpectrumSignError
+from csas_shadow_ros.core.imaging.subaperture import Spectrum
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.pipeline import run
+from csas_shadow_ros.core.search.bodies import search_image, spectrum_sign_evidence
 from csas_shadow_ros.core.search.decision import decide
 from csas_shadow_ros.core.shape.result import LeftOut, Result
 from csas_shadow_ros.core.shape.verdict import judge
-from csas_shadow_ros.core.subaperture import Spectrum
-from csas_shadow_ros.core.target import search_image, spectrum_sign_evidence
-from csas_shadow_ros.core.volume import Target
+from csas_shadow_ros.core.shape.volume import Target
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.profiles import Faults
 from csas_shadow_ros.simulation.seabed import Bump, Patch, Seabed

@@ -12,7 +12,7 @@ from core_data import acoustics, band_limited_image, normalised_rms
 from csas_shadow_ros.core import reference
 from csas_shadow_ros.core.errors import GeometryError
 from csas_shadow_ros.core.geometry import GroundGrid
-from csas_shadow_ros.core.sector import Sector, image_from_sectors
+from csas_shadow_ros.core.sectors.sector import Sector, image_from_sectors
 
 
 def sectors_of(image, n):

@@ -16,10 +16,10 @@ from csas_shadow_ros.core.parameters import (
     SubApertureParameters,
     TargetParameters,
 )
+from csas_shadow_ros.core.search.bodies import Search, stands_on_seabed
 from csas_shadow_ros.core.search.decision import decide
-from csas_shadow_ros.core.shape.pieces import connected_pieces, overlap_share
-from csas_shadow_ros.core.target import Search, stands_on_seabed
-from csas_shadow_ros.core.volume import Target, Volume, VoxelGrid
+from csas_shadow_ros.core.search.pieces import connected_pieces, overlap_share
+from csas_shadow_ros.core.shape.volume import Target, Volume, VoxelGrid
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.targets import box, cylinder, join_bodies
 

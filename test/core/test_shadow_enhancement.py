@@ -20,9 +20,9 @@ from core_data import (
 from csas_shadow_ros.core import reference
 from csas_shadow_ros.core.errors import ViewError
 from csas_shadow_ros.core.geometry import CoherentImage, View
+from csas_shadow_ros.core.imaging.enhancement import enhance, focus, focus_phase_rate, focus_range
+from csas_shadow_ros.core.imaging.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.core.parameters import ShadowParameters, SubApertureParameters
-from csas_shadow_ros.core.shadow import enhance, focus, focus_phase_rate, focus_range
-from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
 
 TARGET = (0.3, -0.2)
 EXACT, SMALL, NONE = (ShadowParameters(enhancement=e) for e in ("exact", "small_angle", "none"))

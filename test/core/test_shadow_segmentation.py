@@ -7,8 +7,8 @@ import pytest
 from core_data import make_view
 from scipy import ndimage
 
-from csas_shadow_ros.core.likelihood import view_levels
-from csas_shadow_ros.core.segmentation import dark_pixels, segment_shadow
+from csas_shadow_ros.core.imaging.likelihood import view_levels
+from csas_shadow_ros.core.imaging.segmentation import dark_pixels, segment_shadow
 
 SIZE = 400
 MIDDLE = SIZE // 2

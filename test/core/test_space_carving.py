@@ -11,12 +11,12 @@ import pytest
 import scipy.ndimage
 from core_data import HEIGHT_M, hidden_by_box, hidden_by_cylinder, hull_of, iou, make_info, perfect_views
 
-from csas_shadow_ros.core.carving import Carver, carve
 from csas_shadow_ros.core.errors import GeometryError, ParameterError, ViewError
 from csas_shadow_ros.core.geometry import View
 from csas_shadow_ros.core.parameters import CarvingParameters
-from csas_shadow_ros.core.threshold import object_threshold, occupied_voxels, supported
-from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.shape.carving import Carver, carve
+from csas_shadow_ros.core.shape.threshold import object_threshold, occupied_voxels, supported
+from csas_shadow_ros.core.shape.volume import Volume
 
 KINDS = [("soft", "likelihood"), ("consensus", "mask"), ("hard", "mask")]
 SOFT = CarvingParameters(method="soft")

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from core_data import band_limited_image, circle_track
 
-from csas_shadow_ros.core.arcs import Arc, Arcs
 from csas_shadow_ros.core.errors import GeometryError, SpectrumSignError
 from csas_shadow_ros.core.geometry import Track
+from csas_shadow_ros.core.geometry.arcs import Arc, Arcs
 from csas_shadow_ros.core.parameters import (
     CarvingParameters,
     PipelineParameters,
@@ -20,8 +20,8 @@ from csas_shadow_ros.core.parameters import (
     TargetParameters,
 )
 from csas_shadow_ros.core.pipeline import run as run_whole
-from csas_shadow_ros.core.sector import Sector
-from csas_shadow_ros.core.streaming import SectorSum, Stream, StreamedRun
+from csas_shadow_ros.core.sectors.sector import Sector
+from csas_shadow_ros.core.sectors.streaming import SectorSum, Stream, StreamedRun
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.sectors import sectors_of_run
 

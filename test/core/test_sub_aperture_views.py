@@ -26,8 +26,8 @@ from core_data import (
 from csas_shadow_ros.core import reference
 from csas_shadow_ros.core.errors import ParameterError, ViewError
 from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, unit_to_sonar
+from csas_shadow_ros.core.imaging.subaperture import Spectrum, SubApertures, taper_table
 from csas_shadow_ros.core.parameters import SubApertureParameters
-from csas_shadow_ros.core.subaperture import Spectrum, SubApertures, taper_table
 
 ASPECTS = [0.0, 33.0, 45.0, 90.0, 141.7, 180.0, 270.0, 333.3]
 

@@ -10,8 +10,8 @@ import pytest
 import trimesh
 
 from csas_shadow_ros.core.errors import NoTargetError
-from csas_shadow_ros.core.mesh import measure, mesh_from_grid
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.shape.mesh import measure, mesh_from_grid
+from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 
 
 def grid_of(inside, volume, *, soft=False, threshold=0.3):

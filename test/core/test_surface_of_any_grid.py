@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from csas_shadow_ros.core.mesh import _march_tetrahedra, mesh_from_grid, surface_field
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.shape.mesh import _march_tetrahedra, mesh_from_grid, surface_field
+from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 
 
 def random_grid(

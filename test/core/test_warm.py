@@ -45,7 +45,7 @@ from pathlib import Path
 from csas_shadow_ros.core import kernels
 from csas_shadow_ros.core.warm import warm_all
 from csas_shadow_ros.parameter_file import pipeline_parameters
-from csas_shadow_ros.process import process_bag
+from csas_shadow_ros.run_bag import process_bag
 from csas_shadow_ros.simulation.warm import warm_simulation
 
 warm_all()

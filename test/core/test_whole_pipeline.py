@@ -11,22 +11,22 @@ import pytest
 from core_data import circle_track, ground_of_pixels, hidden_by_box, iou
 
 from csas_shadow_ros.core import pipeline
-from csas_shadow_ros.core.carving import Carver
 from csas_shadow_ros.core.errors import NoTargetError, ParameterError, SpectrumSignError, ViewError
 from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, Track, View
-from csas_shadow_ros.core.likelihood import outside_likelihood, view_levels
+from csas_shadow_ros.core.imaging.enhancement import enhance
+from csas_shadow_ros.core.imaging.likelihood import outside_likelihood, view_levels
+from csas_shadow_ros.core.imaging.segmentation import require_silhouette, segment_shadow
+from csas_shadow_ros.core.imaging.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.core.parameters import (
     CarvingParameters,
     PipelineParameters,
     SubApertureParameters,
     TargetParameters,
 )
+from csas_shadow_ros.core.search.bodies import search_views, spectrum_sign_evidence
 from csas_shadow_ros.core.search.decision import decide_by_image
-from csas_shadow_ros.core.segmentation import require_silhouette, segment_shadow
-from csas_shadow_ros.core.shadow import enhance
-from csas_shadow_ros.core.subaperture import Spectrum, SubApertures
-from csas_shadow_ros.core.target import search_views, spectrum_sign_evidence
-from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.shape.carving import Carver
+from csas_shadow_ros.core.shape.volume import Volume
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.targets import box, cylinder
 

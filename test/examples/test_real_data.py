@@ -14,9 +14,9 @@ import trimesh
 from csas_shadow_ros.bags import read_run, write_run
 from csas_shadow_ros.core.errors import CsasError
 from csas_shadow_ros.core.geometry import wrap_angle
-from csas_shadow_ros.core.likelihood import echo_mask, view_levels
+from csas_shadow_ros.core.imaging.likelihood import echo_mask, view_levels
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "examples"))
 import airsas

@@ -28,7 +28,7 @@ from csas_shadow_ros.bags.index import BagIndex
 from csas_shadow_ros.core.errors import BagError, CsasError
 from csas_shadow_ros.core.geometry import Acoustics, ShadowCamera, Track, View, ViewInfo, view_ground_to_pixel
 from csas_shadow_ros.nodes.playing import BagViews, stage_of_bag
-from csas_shadow_ros.process import describe_run
+from csas_shadow_ros.run_bag import describe_run
 from msg_adapters import RosbagsMessages, track_to_msg, view_to_msgs
 from msg_adapters.messages import typestore
 

@@ -29,7 +29,13 @@ from soak import STEP_DEG, STREAMS, VOXEL_M, Bags, hash_of
 
 from csas_shadow_ros.bags import read_run
 from csas_shadow_ros.core.geometry import Track
-from csas_shadow_ros.graph import DomainReservation, Graph, environment_of, new_graph_id, start_fork_server
+from csas_shadow_ros.graph.processes import (
+    DomainReservation,
+    Graph,
+    environment_of,
+    new_graph_id,
+    start_fork_server,
+)
 from csas_shadow_ros.nodes import qos
 from msg_adapters import (
     Heartbeat,

@@ -727,7 +727,7 @@ def two_graphs(bags: Bags, out: Path, circles: int, seed: int) -> list[str]:
     """Two live graphs in one domain and two namespaces, each circling contacts in an order of its own."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from csas_shadow_ros.graph import DomainReservation
+    from csas_shadow_ros.graph.processes import DomainReservation
 
     with DomainReservation() as domain, ThreadPoolExecutor(2) as pool:
         told = []

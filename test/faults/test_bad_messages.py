@@ -31,9 +31,9 @@ from csas_shadow_ros.core.geometry import (
     view_ground_to_pixel,
 )
 from csas_shadow_ros.core.search.decision import Decision
-from csas_shadow_ros.core.sector import Sector
+from csas_shadow_ros.core.sectors.sector import Sector
 from csas_shadow_ros.core.shape.result import Result, ViewEvidence
-from csas_shadow_ros.core.volume import Target, Volume
+from csas_shadow_ros.core.shape.volume import Target, Volume
 from msg_adapters.messages import typestore
 
 CASES = int(os.environ.get("CSAS_BAD_MESSAGES", "200"))

@@ -27,7 +27,7 @@ from routes import (
 
 import csas_shadow_ros as csas
 from csas_shadow_ros.cli import main
-from csas_shadow_ros.core.sector import same_grid
+from csas_shadow_ros.core.sectors.sector import same_grid
 from csas_shadow_ros.importing import ImportSettingsError, Settings, import_run
 from csas_shadow_ros.importing.settings import KEYS
 

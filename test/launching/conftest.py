@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from following import FILE, ROOT, Started, command_of, real_launch
 
-from csas_shadow_ros.nodes.params import NODES
+from csas_shadow_ros.nodes.runtime.params import NODES
 
 
 @pytest.fixture(scope="session")
@@ -86,7 +86,7 @@ def launched(prefix: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 @pytest.fixture
 def domain() -> Iterator[int]:
     """A ROS domain that is the test's own."""
-    from csas_shadow_ros.graph import DomainReservation
+    from csas_shadow_ros.graph.processes import DomainReservation
 
     with DomainReservation() as domain_id:
         yield domain_id

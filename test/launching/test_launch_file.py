@@ -16,7 +16,7 @@ from following import ROOT, Started
 
 from csas_shadow_ros.cli import build_parser
 from csas_shadow_ros.core.geometry import Track
-from csas_shadow_ros.nodes.params import NODES
+from csas_shadow_ros.nodes.runtime.params import NODES
 
 Follow = Callable[..., Started]
 

@@ -29,7 +29,7 @@ def graph() -> Iterator[Graph]:
 @pytest.fixture
 def domain() -> Iterator[int]:
     """A ROS domain that is the test's own."""
-    from csas_shadow_ros.graph import DomainReservation
+    from csas_shadow_ros.graph.processes import DomainReservation
 
     with DomainReservation() as domain_id:
         yield domain_id

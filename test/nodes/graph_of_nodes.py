@@ -17,8 +17,8 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
-from csas_shadow_ros.graph import DomainReservation
-from csas_shadow_ros.nodes.base import CsasNode
+from csas_shadow_ros.graph.processes import DomainReservation
+from csas_shadow_ros.nodes.runtime.base import CsasNode
 
 #: 36 views and few voxels: the same code as for a large run, in a second.
 STEP_DEG, VOXEL_M = 10.0, 0.05

@@ -26,7 +26,7 @@ from rclpy.executors import SingleThreadedExecutor
 
 from csas_shadow_ros.client import ViewSubscriber
 from csas_shadow_ros.core.errors import ParameterError
-from csas_shadow_ros.graph import DomainReservation, Graph, graph_environment, start_fork_server
+from csas_shadow_ros.graph.processes import DomainReservation, Graph, graph_environment, start_fork_server
 from csas_shadow_ros.nodes import qos
 from msg_adapters import Heartbeat, RclpyMessages, measurements_from_msg, progress_from_msg
 from msg_adapters.topics import TOPICS

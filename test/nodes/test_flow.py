@@ -7,7 +7,7 @@ import random
 import pytest
 
 from csas_shadow_ros.core.errors import ParameterError
-from csas_shadow_ros.nodes.flow import Flow
+from csas_shadow_ros.nodes.runtime.flow import Flow
 from msg_adapters import Heartbeat, ViewProgress
 
 

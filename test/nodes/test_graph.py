@@ -15,14 +15,14 @@ pytest.importorskip("rclpy")
 from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M, Graph
 
 from csas_shadow_ros.bags import read_run, write_run
-from csas_shadow_ros.core.likelihood import outside_likelihood
+from csas_shadow_ros.core.imaging.likelihood import outside_likelihood
 from csas_shadow_ros.core.pipeline import ProcessedView, Result
-from csas_shadow_ros.core.sector import Sector
+from csas_shadow_ros.core.sectors.sector import Sector
 from csas_shadow_ros.nodes import qos
 from csas_shadow_ros.nodes.bag_player import BagPlayerNode
 from csas_shadow_ros.nodes.bag_recorder import BagRecorderNode
-from csas_shadow_ros.nodes.base import CsasNode
 from csas_shadow_ros.nodes.composites import CompositesNode
+from csas_shadow_ros.nodes.runtime.base import CsasNode
 from csas_shadow_ros.nodes.shadow_enhancement import ShadowEnhancementNode
 from csas_shadow_ros.nodes.shadow_likelihood import ShadowLikelihoodNode
 from csas_shadow_ros.nodes.sub_aperture import SubApertureNode

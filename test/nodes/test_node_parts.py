@@ -21,11 +21,12 @@ from graph_of_nodes import Graph
 from csas_shadow_ros.bags import BagReader, write_run
 from csas_shadow_ros.core.errors import BagError, ParameterError
 from csas_shadow_ros.core.pipeline import ProcessedView, Result
-from csas_shadow_ros.nodes import params, qos
+from csas_shadow_ros.nodes import qos
 from csas_shadow_ros.nodes.bag_player import BagPlayerNode
-from csas_shadow_ros.nodes.base import INTEGRATED, CsasNode, Inlet, Source, spin
 from csas_shadow_ros.nodes.composites import CompositesNode
 from csas_shadow_ros.nodes.playing import BagViews, header_stamp, schedule, stage_of_bag
+from csas_shadow_ros.nodes.runtime import params
+from csas_shadow_ros.nodes.runtime.base import INTEGRATED, CsasNode, Inlet, Source, spin
 from csas_shadow_ros.nodes.shadow_likelihood import ShadowLikelihoodNode
 from csas_shadow_ros.nodes.sub_aperture import SubApertureNode
 from csas_shadow_ros.nodes.voxel_carver import VoxelCarverNode
@@ -43,7 +44,7 @@ NODES = {
 
 def test_the_yaml_file_is_what_the_dataclasses_say() -> None:
     text = (ROOT / "config" / "csas_shadow.yaml").read_text(encoding="utf-8")
-    assert text == params.yaml_text(), "run: python -m csas_shadow_ros.nodes.params --yaml > config/…"
+    assert text == params.yaml_text(), "run: python -m csas_shadow_ros.nodes.runtime.params --yaml > config/…"
 
 
 def test_the_yaml_file_reads_back_to_the_defaults() -> None:

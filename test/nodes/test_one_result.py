@@ -15,7 +15,7 @@ pytest.importorskip("rclpy")
 from csas_shadow_ros.bags import BagReader
 from csas_shadow_ros.core.geometry import Datum
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
-from csas_shadow_ros.process import process_bag, replay_bag
+from csas_shadow_ros.run_bag import process_bag, replay_bag
 from csas_shadow_ros.simulation.bag import simulate_bag
 from csas_shadow_ros.simulation.targets import box, cylinder, join_bodies
 from msg_adapters import TOPICS, measurements_from_msg, objects_from_msg, topic

@@ -23,13 +23,11 @@ pytest.importorskip("rclpy")
 
 from graph_of_nodes import PARAMETERS, STEP_DEG
 
-from csas_shadow_ros import graph as graph_module
-from csas_shadow_ros import replay as module
 from csas_shadow_ros.bags import read_run, write_run
 from csas_shadow_ros.core.errors import BagError, NoTargetError, ParameterError, SpectrumSignError
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.pipeline import ProcessedView, Result, run
-from csas_shadow_ros.graph import (
+from csas_shadow_ros.graph.processes import (
     DomainReservation,
     Graph,
     GraphProcess,
@@ -37,8 +35,10 @@ from csas_shadow_ros.graph import (
     graph_environment,
     start_fork_server,
 )
+from csas_shadow_ros.graph.processes import processes as graph_module
+from csas_shadow_ros.graph.processes import replay as module
+from csas_shadow_ros.graph.replay import replay
 from csas_shadow_ros.nodes.runtime.shared_memory import segments_of
-from csas_shadow_ros.replay import replay
 from csas_shadow_ros.simulation import SimulatedRun
 
 Reference = tuple[Result, list[ProcessedView]]
@@ -297,7 +297,7 @@ def test_a_results_folder_that_is_a_file_is_refused_by_name(run_bag: Path, tmp_p
 def test_nodes_end_when_the_process_that_started_them_was_killed(tmp_path: Path, forked: bool) -> None:
     code = (
         "import sys, time; from pathlib import Path\n"
-        "from csas_shadow_ros.graph import DomainReservation, Graph, start_fork_server\n"
+        "from csas_shadow_ros.graph.processes import DomainReservation, Graph, start_fork_server\n"
         f"held = DomainReservation(); d, log = held.domain_id, Path({str(tmp_path)!r})\n"
         f"server = start_fork_server(d, log).__enter__() if {forked} else None\n"
         "g = Graph({'composites': {}}, d, log, server=server)\n"

@@ -18,14 +18,14 @@ pytest.importorskip("rclpy")
 
 from graph_of_nodes import PARAMETERS, Graph
 
-from csas_shadow_ros import replay as module
 from csas_shadow_ros.bags import BagReader, BagWriter, read_run
 from csas_shadow_ros.bags.bag import copy
 from csas_shadow_ros.core.pipeline import ProcessedView, Result
+from csas_shadow_ros.graph.processes import replay as module
+from csas_shadow_ros.graph.replay import replay
 from csas_shadow_ros.nodes.bag_player import BagPlayerNode
 from csas_shadow_ros.nodes.bag_recorder import BagRecorderNode
-from csas_shadow_ros.nodes.flow import Flow
-from csas_shadow_ros.replay import replay
+from csas_shadow_ros.nodes.runtime.flow import Flow
 from msg_adapters.progress import INTEGRATED, Heartbeat, ViewProgress
 
 Reference = tuple[Result, list[ProcessedView]]

@@ -11,7 +11,7 @@ pytest.importorskip("rclpy")
 
 from graph_of_nodes import Graph
 
-from csas_shadow_ros.core.display import decibel_picture
+from csas_shadow_ros.core.imaging.display import decibel_picture
 from csas_shadow_ros.nodes import qos
 from csas_shadow_ros.nodes.playing import topics_to_record
 from csas_shadow_ros.nodes.shadow_enhancement import ShadowEnhancementNode

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from csas_shadow_ros.nodes import start
-from csas_shadow_ros.nodes.params import NODES
+from csas_shadow_ros.nodes.runtime import start
+from csas_shadow_ros.nodes.runtime.params import NODES
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -15,8 +15,8 @@ from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M, Graph
 
 from csas_shadow_ros.bags import read_run, write_run
 from csas_shadow_ros.core.pipeline import Result, run
-from csas_shadow_ros.core.sector import Sector
-from csas_shadow_ros.core.streaming import Stream
+from csas_shadow_ros.core.sectors.sector import Sector
+from csas_shadow_ros.core.sectors.streaming import Stream
 from csas_shadow_ros.nodes import qos, sub_aperture
 from csas_shadow_ros.nodes.bag_player import BagPlayerNode
 from csas_shadow_ros.nodes.shadow_enhancement import ShadowEnhancementNode

@@ -20,16 +20,16 @@ from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M, Graph
 import csas_shadow_ros
 from csas_shadow_ros.bags import write_run
 from csas_shadow_ros.core.pipeline import ProcessedView, Result, run
-from csas_shadow_ros.graph import DomainReservation, ReplayError
+from csas_shadow_ros.graph.processes import DomainReservation, ReplayError
+from csas_shadow_ros.graph.replay import replay
 from csas_shadow_ros.nodes.bag_player import BagPlayerNode
 from csas_shadow_ros.nodes.bag_recorder import BagRecorderNode
-from csas_shadow_ros.nodes.rivals import Rivals
+from csas_shadow_ros.nodes.runtime.rivals import Rivals
 from csas_shadow_ros.nodes.runtime.shared_memory import unused
 from csas_shadow_ros.nodes.shadow_enhancement import ShadowEnhancementNode
 from csas_shadow_ros.nodes.shadow_likelihood import ShadowLikelihoodNode
 from csas_shadow_ros.nodes.sub_aperture import SubApertureNode
 from csas_shadow_ros.nodes.voxel_carver import VoxelCarverNode
-from csas_shadow_ros.replay import replay
 from csas_shadow_ros.simulation import simulate
 from msg_adapters.progress import GRAPH_ID, Heartbeat, instance_of
 

@@ -23,8 +23,8 @@ pytest.importorskip("aiohttp")
 from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M
 
 from csas_shadow_ros.core.pipeline import ProcessedView, Result
-from csas_shadow_ros.graph import DomainReservation, Graph, graph_environment
-from csas_shadow_ros.replay import replay
+from csas_shadow_ros.graph.processes import DomainReservation, Graph, graph_environment
+from csas_shadow_ros.graph.replay import replay
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "viewer"))
 from browser import Watched, launched

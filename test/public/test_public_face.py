@@ -20,8 +20,8 @@ import pytest
 from matplotlib.image import imread
 
 import csas_shadow_ros as csas
+from csas_shadow_ros.core.later_stages import STAGES
 from csas_shadow_ros.core.pipeline import run as run_pipeline
-from csas_shadow_ros.core.stages import STAGES
 from csas_shadow_ros.progress import progress_bar
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -135,7 +135,7 @@ def test_whatever_part_fails_the_grid_and_the_other_parts_are_there(box_bag, tmp
     monkeypatch.setattr(folder_module, "score", scored)
     monkeypatch.setattr(ResultBag, "write_view", write_view)
     monkeypatch.setitem(figures_module.FIGURES, "figure_1b_multilook", draw)
-    monkeypatch.setattr("csas_shadow_ros.process.describe_run", lambda run: {}["gone"])
+    monkeypatch.setattr("csas_shadow_ros.run_bag.describe_run", lambda run: {}["gone"])
     out = tmp_path / "out"
     assert main(["run", str(box_bag), "--out", str(out), *FAST]) == 3
     report = read_report(out)

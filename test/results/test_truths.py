@@ -13,9 +13,9 @@ import pytest
 import trimesh
 
 from csas_shadow_ros.core.errors import CsasError, GeometryError
-from csas_shadow_ros.core.mesh import measure, mesh_from_grid
-from csas_shadow_ros.core.solid import apart, judge_solid, open_edges
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.shape.mesh import measure, mesh_from_grid
+from csas_shadow_ros.core.shape.solid import apart, judge_solid, open_edges
+from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 from csas_shadow_ros.results import TruthError, read_truth, score
 from csas_shadow_ros.results.truth import of_nothing, of_objects, placed
 from csas_shadow_ros.simulation import get_profile, make_scene, simulate

@@ -10,7 +10,7 @@ import scipy.spatial
 import trimesh
 
 from csas_shadow_ros.core.errors import GeometryError
-from csas_shadow_ros.core.volume import Volume
+from csas_shadow_ros.core.shape.volume import Volume
 from csas_shadow_ros.simulation import TARGETS, iou, make_scene, shadow_hull, voxelise_truth
 from csas_shadow_ros.simulation.targets import empty_mesh
 

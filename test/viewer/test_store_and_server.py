@@ -18,9 +18,9 @@ from synthetic import entry
 
 from csas_shadow_ros.bags import BagReader, BagWriter, read_run
 from csas_shadow_ros.cli import main
-from csas_shadow_ros.core.mesh import mesh_from_grid
 from csas_shadow_ros.core.parameters import SubApertureParameters
-from csas_shadow_ros.core.volume import Volume, VoxelGrid
+from csas_shadow_ros.core.shape.mesh import mesh_from_grid
+from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 from csas_shadow_ros.viewer import codes
 from csas_shadow_ros.viewer.server import ViewerServer, is_loopback
 from csas_shadow_ros.viewer.source import PathSource, Reduced

@@ -19,7 +19,7 @@ from ..errors import ParameterError
 from .frames import FloatArray
 
 if TYPE_CHECKING:
-    from ..mesh import Dimensions
+    from ..shape.mesh import Dimensions
 
 #: WGS-84 (NIMA TR8350.2): half major axis (m), flattening, and the square of the eccentricity.
 _A, _F = 6378137.0, 1.0 / 298.257223563

@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 
 from ..errors import NoTargetError, ViewError
 from ..geometry import TWO_PI, CoherentImage, Track, View, ViewInfo, fit_target_to_focus, wrap_angle
+from ..imaging.enhancement import enhance
+from ..imaging.subaperture import Spectrum
 from ..parameters import (
     MAX_OBJECTS,
     PipelineParameters,
     ShadowParameters,
     TargetParameters,
 )
-from ..shadow import enhance
 from ..shape.result import LeftOut
-from ..subaperture import Spectrum
-from ..target import Search, SignEvidence, search_image, search_views, spectrum_sign_evidence
-from ..volume import Target
+from ..shape.volume import Target
+from .bodies import Search, SignEvidence, search_image, search_views, spectrum_sign_evidence
 
 #: How many views from all round look for the target: one every 10°, as the search in an image makes them.
 _SEARCH_VIEWS = 36

@@ -11,8 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from ..composites import level_image
 from ..geometry import View
+from ..imaging.composites import level_image
 from .verdict import no_object_reason
 
 if TYPE_CHECKING:

@@ -10,20 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry import SCENE_FRAME
-from ..mesh import Dimensions
-from ..volume import Target, VoxelGrid
+from .mesh import Dimensions
+from .volume import Target, VoxelGrid
 
 if TYPE_CHECKING:
     import trimesh
     import xarray
     from matplotlib.figure import Figure
 
-    from ..composites import Composites
     from ..geometry import Datum, Place, View
-    from ..hollows import EchoLook
-    from ..measurement import SilhouetteSides
+    from ..imaging.composites import Composites
+    from ..search.bodies import SignEvidence
     from ..search.decision import Decision
-    from ..target import SignEvidence
+    from .hollows import EchoLook
+    from .measurement import SilhouetteSides
 
 #: What a run can find.
 VERDICTS = ("object", "no object", "undecided")

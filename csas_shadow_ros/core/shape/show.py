@@ -13,7 +13,7 @@ from .verdict import no_object_reason
 if TYPE_CHECKING:
     import xarray
 
-    from ..mesh import Dimensions
+    from .mesh import Dimensions
     from .result import Result
 
 #: Dots per inch of the picture in a notebook's table: about 700 pixels wide.

@@ -8,9 +8,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh import Dimensions
-from ..volume import VoxelGrid
+from .mesh import Dimensions
 from .result import Quality, Result
+from .volume import VoxelGrid
 
 #: A result of less of the circle is limited: what is not seen from the other side is bounded by the volume
 #: alone (share of the circle). At half of it sides are missing without a word; at double none would be good.

@@ -14,10 +14,10 @@ from csas_shadow_ros.core.parameters import PlaceParameters
 from msg_adapters import origin_from_msg, origin_to_msg, scene_transform_to_msg
 
 from .. import qos
-from ..params import part
+from .params import part
 
 if TYPE_CHECKING:
-    from ..base import CsasNode
+    from .base import CsasNode
 
 #: Origins that are kept: a mission says one for each contact, and runs that are not over are few.
 _MOST = 64

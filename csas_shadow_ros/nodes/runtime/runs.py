@@ -12,7 +12,7 @@ from msg_adapters import TOPICS, frame_of, message_from_cdr, track_piece_from_ms
 from .. import qos
 
 if TYPE_CHECKING:
-    from ..base import CsasNode
+    from .base import CsasNode
 
 #: So long a message waits for a track that covers its stamp (s): a vehicle publishes its track at 1 Hz or
 #: faster, and ten of these may be lost. At half of it a slow track costs views; at double nothing but memory.

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import GeometryError
-from .geometry import SCENE_FRAME, Acoustics, CoherentImage, GroundGrid
+from ..errors import GeometryError
+from ..geometry import SCENE_FRAME, Acoustics, CoherentImage, GroundGrid
 
 
 class HasBand(Protocol):

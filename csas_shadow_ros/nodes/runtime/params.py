@@ -1,7 +1,7 @@
 """Parameters of the nodes: the core's dataclasses, plus what only a node needs.
 
 One dataclass a node drives its ROS parameter descriptors, ``config/csas_shadow.yaml`` and the README's
-table; a test holds the three together. ``python -m csas_shadow_ros.nodes.params`` prints the table,
+table; a test holds the three together. ``python -m csas_shadow_ros.nodes.runtime.params`` prints the table,
 with ``--yaml`` the YAML file.
 """
 
@@ -340,7 +340,7 @@ def yaml_text(values: Mapping[str, Mapping[str, Any]] | None = None, *, only_giv
     if not only_given:
         lines += [
             "# Parameters of all nodes, with their defaults. Written by",
-            "# python -m csas_shadow_ros.nodes.params --yaml; a test compares. Nodes refuse unknown names.",
+            "# python -m csas_shadow_ros.nodes.runtime.params --yaml; a test compares. Nodes refuse others.",
         ]
     for name, kind in NODES.items():
         own = given.get(name, {})

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import GeometryError
+from ..errors import GeometryError
 
 if TYPE_CHECKING:
     import trimesh

@@ -24,15 +24,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .echo import echo_zone, opaque_part
-from .errors import ParameterError, ViewError
+from ..errors import ParameterError, ViewError
+from ..geometry import View, ViewInfo
+from ..imaging.masks import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, KeptMask
+from ..kernels import kernel
+from ..parameters import CarvingParameters
+from ..threads import in_order
 from .explained import ShadowFit, count_shadow_pixels, shadow_fit, unexplained_shadow
-from .geometry import View, ViewInfo
-from .kernels import kernel
-from .masks import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, KeptMask
-from .parameters import CarvingParameters
+from .layover import echo_zone, opaque_part
 from .seabed import SeabedSlope, seabed_slope, shadow_end
-from .threads import in_order
 from .threshold import LEAST_VOXELS, least_threshold, least_views_fraction, thresholded
 from .volume import Volume, VoxelGrid
 

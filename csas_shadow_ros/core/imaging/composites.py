@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.color import hsv2rgb
 
-from .errors import ParameterError, check_range
-from .geometry import TWO_PI, GroundGrid, View
-from .kernels import kernel
+from ..errors import ParameterError, check_range
+from ..geometry import TWO_PI, GroundGrid, View
+from ..kernels import kernel
 
 FloatImage = NDArray[np.float32]
 

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import View
-from .kernels import kernel
-from .masks import MASK_OUTSIDE, MASK_SHADOW
+from ..geometry import View
+from ..imaging.masks import MASK_OUTSIDE, MASK_SHADOW
+from ..kernels import kernel
 from .volume import Volume, VoxelGrid
 
 BoolArray = NDArray[np.bool_]

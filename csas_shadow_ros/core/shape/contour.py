@@ -23,8 +23,8 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from .geometry import ViewInfo, down_range_axis
-from .kernels import kernel
+from ..geometry import ViewInfo, down_range_axis
+from ..kernels import kernel
 
 FloatArray = NDArray[np.float64]
 

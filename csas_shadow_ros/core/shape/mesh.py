@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import NoTargetError
+from ..errors import NoTargetError
 from .volume import VoxelGrid
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def mesh_from_grid(grid: VoxelGrid) -> trimesh.Trimesh:
     Examples
     --------
     >>> import numpy as np
-    >>> from csas_shadow_ros.core.volume import Volume, VoxelGrid
+    >>> from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
     >>> occupied = np.zeros((3, 3, 3), bool)
     >>> occupied[0, 1, 1] = True
     >>> likelihood = np.where(occupied, np.float32(0), np.float32(1))

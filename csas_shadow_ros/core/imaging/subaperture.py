@@ -22,8 +22,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from .errors import ParameterError, TrackError, ViewError
-from .geometry import (
+from ..errors import ParameterError, TrackError, ViewError
+from ..geometry import (
     CoherentImage,
     GroundGrid,
     ShadowCamera,
@@ -34,9 +34,9 @@ from .geometry import (
     one_frame,
     view_ground_to_pixel,
 )
-from .kernels import kernel
-from .parameters import SubApertureParameters
-from .taps import interpolate_four, interpolate_one
+from ..kernels import kernel
+from ..parameters import SubApertureParameters
+from .interpolation import interpolate_four, interpolate_one
 
 #: Taps of the interpolation kernel along each axis.
 _TAPS = 4

@@ -14,11 +14,11 @@ import numpy as np
 
 from .bags import BagReader, Problem, Run, read_run
 from .bags.metadata import read_metadata
-from .core.arcs import Arc, Arcs
 from .core.errors import BagError, CsasError, check_type
 from .core.geometry import CoherentImage, Track
+from .core.geometry.arcs import Arc, Arcs
+from .core.later_stages import STAGES
 from .core.parameters import MAX_OBJECTS, PipelineParameters
-from .core.stages import STAGES
 from .from_bag import (
     Notice,
     Progress,
@@ -193,7 +193,7 @@ def replay_bag(
             f"replay needs ROS 2, which is not there ({error}); source it, or pip install"
             " 'csas_shadow_ros[ros]', or use `csas-shadow run`"
         ) from error
-    from .replay import replay
+    from .graph.replay import replay
 
     p = parameters or PipelineParameters()
     with ResultsWriter(

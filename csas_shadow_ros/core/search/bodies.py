@@ -19,20 +19,20 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from .carving import Carver
-from .errors import NoTargetError, SpectrumSignError, ViewError
-from .geometry import TWO_PI, CoherentImage, ShadowCamera, Track, View
-from .likelihood import Levels, box_mean, outside_likelihood, view_levels
-from .parameters import (
+from ..errors import NoTargetError, SpectrumSignError, ViewError
+from ..geometry import TWO_PI, CoherentImage, ShadowCamera, Track, View
+from ..imaging.enhancement import enhance
+from ..imaging.likelihood import Levels, box_mean, outside_likelihood, view_levels
+from ..imaging.subaperture import Spectrum, SubApertures
+from ..parameters import (
     CarvingParameters,
     LikelihoodParameters,
     ShadowParameters,
     SubApertureParameters,
 )
-from .shadow import enhance
-from .shape.result import LeftOut
-from .subaperture import Spectrum, SubApertures
-from .volume import MARGIN_SHARE, Target, Volume
+from ..shape.carving import Carver
+from ..shape.result import LeftOut
+from ..shape.volume import MARGIN_SHARE, Target, Volume
 
 #: Aperture (deg) of the views that search: narrow enough that shadows stay sharp without enhancement.
 _SEARCH_APERTURE_DEG = 6.0

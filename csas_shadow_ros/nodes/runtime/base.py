@@ -38,7 +38,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from csas_shadow_ros.core.errors import CsasError, ParameterError
 from csas_shadow_ros.core.geometry import View
 from csas_shadow_ros.core.search.decision import Decision
-from csas_shadow_ros.core.volume import Target
+from csas_shadow_ros.core.shape.volume import Target
 from msg_adapters import (
     TOPICS,
     Heartbeat,
@@ -65,13 +65,13 @@ from msg_adapters.progress import INTEGRATED, PUBLISHED, REJECTED, instance_of
 from msg_adapters.topics import stream as stream_of
 from msg_adapters.topics import topic as topic_of
 
-from . import qos
+from .. import qos
 from .flow import Flow
+from .hearing import make_hearing
+from .host import Host
 from .params import DYNAMIC, NODES, declare, from_overrides
 from .rivals import Rivals
-from .runtime.hearing import make_hearing
-from .runtime.host import Host
-from .runtime.shared_memory import tidy_up_after_a_killed_graph
+from .shared_memory import tidy_up_after_a_killed_graph
 
 NAMESPACE = "csas"
 BEAT_S = 0.5

@@ -15,10 +15,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .core import errors
-from .core.errors import CsasError, NoTargetError, ParameterError
-from .core.parameters import MAX_OBJECTS, PipelineParameters
-from .graph import (
+from ..core import errors
+from ..core.errors import CsasError, NoTargetError, ParameterError
+from ..core.parameters import MAX_OBJECTS, PipelineParameters
+from ..nodes.runtime.params import NODES, check
+from .processes import (
     MAX_DOMAIN_ID,
     DomainReservation,
     Graph,
@@ -28,18 +29,17 @@ from .graph import (
     signals_deferred,
     start_fork_server,
 )
-from .nodes.params import NODES, check
 
 # What takes long to import is imported where it is used: the nodes' processes are on their way by then.
 if TYPE_CHECKING:
     import trimesh
     from numpy.typing import NDArray
 
-    from .core.geometry import GroundGrid
-    from .core.mesh import Dimensions
-    from .core.search.decision import Decision
-    from .core.shape.result import Result
-    from .core.volume import Target, VoxelGrid
+    from ..core.geometry import GroundGrid
+    from ..core.search.decision import Decision
+    from ..core.shape.mesh import Dimensions
+    from ..core.shape.result import Result
+    from ..core.shape.volume import Target, VoxelGrid
 
 #: Stages of a bag, and the nodes that turn each into the next.
 _CHAIN = {
@@ -193,8 +193,8 @@ class _Watcher:
 
         from msg_adapters import RclpyMessages
 
-        from .nodes import qos
-        from .nodes.runtime.hearing import make_hearing
+        from ..nodes import qos
+        from ..nodes.runtime.hearing import make_hearing
 
         self._qos = qos
         self._rclpy = rclpy
@@ -497,14 +497,14 @@ def _plan(
     bag: str | Path, stage: str, p: PipelineParameters, namespace: str | None = None
 ) -> tuple[str, Decision | None]:
     """Say what is played, and what is carved if no node can decide it."""
-    from .bags import BagReader, read_run
-    from .nodes.playing import stage_of_bag
+    from ..bags import BagReader, read_run
+    from ..nodes.playing import stage_of_bag
 
     chosen = stage_of_bag(BagReader(bag, namespace), stage)
     if chosen in ("image", "sector"):
         return chosen, None
-    from .core.stages import check_method
-    from .from_bag import decision_of_views
+    from ..core.later_stages import check_method
+    from ..from_bag import decision_of_views
 
     check_method(chosen, p)
     decision = decision_of_views(read_run(bag, namespace), chosen, p, 1)
@@ -584,7 +584,7 @@ def _until_complete(
     # What the result takes is loaded while the nodes are, one after the other: later they need every core.
     import trimesh  # noqa: F401
 
-    from .core import mesh, threshold  # noqa: F401
+    from ..core.shape import mesh, threshold  # noqa: F401
 
     source = "sub_aperture" if stage in ("image", "sector") else stage
     sender = "sub_aperture" if stage in ("image", "sector") else "bag_player"
@@ -622,7 +622,7 @@ def _until_complete(
 
 
 def _sinks_complete(graph: Graph, watcher: _Watcher) -> bool:
-    from .nodes.playing import recorded_streams
+    from ..nodes.playing import recorded_streams
 
     for name in ("voxel_carver", "composites"):
         if name not in graph.processes:
@@ -697,8 +697,8 @@ def _not_recorded(
     recording: Path, topics: str, result: ReplayResult, published: Iterable[str], messages: set[str]
 ) -> list[str]:
     """Hold a recording against what was published; one line for each topic or stream that is not whole."""
-    from .bags import BagReader
-    from .nodes.playing import recorded_streams, topics_to_record
+    from ..bags import BagReader
+    from ..nodes.playing import recorded_streams, topics_to_record
 
     try:
         reader = BagReader(recording)

@@ -23,9 +23,9 @@ from typing import IO, Any
 
 from msg_adapters.progress import GRAPH_ID
 
-from .core.errors import CsasError
-from .nodes.params import check, yaml_text
-from .nodes.runtime.shared_memory import (
+from ..core.errors import CsasError
+from ..nodes.runtime.params import check, yaml_text
+from ..nodes.runtime.shared_memory import (
     LOCKED_S,
     LONG_LOCKED_S,
     bound,

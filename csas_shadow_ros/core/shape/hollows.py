@@ -26,10 +26,10 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from .echo import count_looks, layover_per_metre
-from .geometry import ViewInfo
-from .likelihood import Levels, box_mean
-from .local_means import ECHO_CELLS
+from ..geometry import ViewInfo
+from ..imaging.likelihood import Levels, box_mean
+from ..imaging.local_means import ECHO_CELLS
+from .layover import count_looks, layover_per_metre
 from .mesh import mesh_from_grid
 from .volume import Volume, VoxelGrid
 

@@ -12,12 +12,12 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from ..carving import part_around
-from ..search.decision import PHANTOM
-from ..target import stands_on_seabed
-from ..threshold import LEAST_VOXELS
-from ..volume import VoxelGrid
-from .result import LeftOut
+from ..shape.carving import part_around
+from ..shape.result import LeftOut
+from ..shape.threshold import LEAST_VOXELS
+from ..shape.volume import VoxelGrid
+from .bodies import stands_on_seabed
+from .decision import PHANTOM
 
 #: Why a body is none of which the views leave nothing.
 NOTHING_LEFT = "no voxel of its volume lies in shadow from all sides"

@@ -29,11 +29,11 @@ import scipy.ndimage
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from ..geometry import TWO_PI, View, ViewInfo, cross_range_axis, down_range_axis
+from ..imaging.likelihood import Levels
+from ..imaging.local_means import LocalMeans
+from ..imaging.masks import MASK_SHADOW, MASK_UNKNOWN
 from .contour import Contour, contour_height, contour_of
-from .geometry import TWO_PI, View, ViewInfo, cross_range_axis, down_range_axis
-from .likelihood import Levels
-from .local_means import LocalMeans
-from .masks import MASK_SHADOW, MASK_UNKNOWN
 from .mesh import Dimensions, digits_of, measure
 from .seabed import largest_piece
 from .volume import VoxelGrid

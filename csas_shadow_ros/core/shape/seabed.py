@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import ShadowCamera, View, ViewInfo, cross_range_axis, down_range_axis
+from ..geometry import ShadowCamera, View, ViewInfo, cross_range_axis, down_range_axis
 
 #: Values of a shadow mask that are needed here (`carving.MASK_UNKNOWN`, `carving.MASK_SHADOW`).
 _UNKNOWN, _SHADOW = 128, 255

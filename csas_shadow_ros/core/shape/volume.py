@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import GeometryError, check_range
+from ..errors import GeometryError, check_range
 
 if TYPE_CHECKING:
     from .seabed import SeabedSlope

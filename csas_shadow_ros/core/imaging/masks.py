@@ -9,8 +9,8 @@ import lz4.block
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import View, ViewInfo
-from .kernels import kernel
+from ..geometry import View, ViewInfo
+from ..kernels import kernel
 
 #: Values of a shadow mask (mono8). Covered: lit, between an echo and the shadow behind it; either the
 #: target's own echo, laid over what it hides, or seabed that is seen under it.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import TWO_PI
+from . import TWO_PI
 
 #: Ends of arcs that are nearer than that are one.
 TOLERANCE_RAD = 1e-6

@@ -15,8 +15,8 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from .geometry import ViewInfo, unit_to_sonar
-from .kernels import kernel
+from ..geometry import ViewInfo, unit_to_sonar
+from ..kernels import kernel
 from .volume import Volume
 
 BoolArray = NDArray[np.bool_]

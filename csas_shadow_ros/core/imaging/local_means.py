@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .kernels import kernel
+from ..kernels import kernel
 
 FloatImage = NDArray[np.float32]
 BoolImage = NDArray[np.bool_]

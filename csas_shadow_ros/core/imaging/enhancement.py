@@ -14,10 +14,10 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from .errors import ViewError
-from .geometry import View, ViewInfo, cross_range_axis, down_range_axis
-from .kernels import kernel
-from .parameters import ShadowParameters
+from ..errors import ViewError
+from ..geometry import View, ViewInfo, cross_range_axis, down_range_axis
+from ..kernels import kernel
+from ..parameters import ShadowParameters
 
 #: Rows after which a running product of phases starts anew: its rounding stays under 1e-5.
 _RUN = 32

@@ -18,21 +18,21 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from .arcs import TOLERANCE_RAD, Arc, Arcs
-from .errors import GeometryError, NoTargetError, ViewError
-from .geometry import TWO_PI, CoherentImage, Track
-from .geometry.passage import passage
-from .kernels import kernel
-from .parameters import MAX_OBJECTS, PipelineParameters, SubApertureParameters, TargetParameters
-from .search.decision import Decision, decide_by_image
+from ..errors import GeometryError, NoTargetError, ViewError
+from ..geometry import TWO_PI, CoherentImage, Track
+from ..geometry.arcs import TOLERANCE_RAD, Arc, Arcs
+from ..geometry.passage import passage
+from ..imaging.subaperture import Spectrum, SubApertures
+from ..kernels import kernel
+from ..parameters import MAX_OBJECTS, PipelineParameters, SubApertureParameters, TargetParameters
+from ..search.decision import Decision, decide_by_image
+from ..shape.volume import Target, VoxelGrid
 from .sector import Sector, unlike
-from .subaperture import Spectrum, SubApertures
-from .volume import Target, VoxelGrid
 
 if TYPE_CHECKING:
-    from .pipeline import ProcessedView
-    from .reconstruction import Reconstruction
-    from .shape.result import Result
+    from ..pipeline import ProcessedView
+    from ..reconstruction import Reconstruction
+    from ..shape.result import Result
 
 #: Sectors share so much at their common edge that rounding leaves no bin to neither.
 _EDGE_RAD = 1e-4
@@ -588,8 +588,8 @@ class StreamedRun:
 
     def _advance(self) -> list[ProcessedView]:
         # Late: whoever takes a `Stream` alone, as the node does that all others wait for, needs none of it.
-        from .pipeline import process
-        from .reconstruction import Reconstruction
+        from ..pipeline import process
+        from ..reconstruction import Reconstruction
 
         stream, p = self.stream, self.parameters
         due = [stream.aspect_of(stamp) for stamp in stream.update()]
@@ -618,7 +618,7 @@ class StreamedRun:
 
     def result(self, *, final: bool | None = None) -> Result:
         """Say what there is by now; by default in full once the run is over."""
-        from .shape.result import Result
+        from ..shape.result import Result
 
         if self.reconstruction is None:
             return Result(final=False)

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from .parameters import CarvingParameters
+from ..parameters import CarvingParameters
 from .volume import Volume, VoxelGrid
 
 #: Soft: where the threshold lies between the darkest voxels (0) and the brightest (1) of the volume. A

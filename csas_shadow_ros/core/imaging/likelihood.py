@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ViewError
-from .geometry import View
-from .kernels import kernel
+from ..errors import ViewError
+from ..geometry import View
+from ..kernels import kernel
+from ..parameters import LikelihoodParameters
 from .local_means import LocalMeans, Spans, known_span
-from .parameters import LikelihoodParameters
 
 FloatImage = NDArray[np.float32]
 
