@@ -82,7 +82,7 @@ def config_file(name: str) -> Path:
     """
     here = Path(__file__).resolve()
     prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
-    places = [here.parents[1] / "config" / name]
+    places = [here.parents[2] / "config" / name]
     places += [Path(prefix) / "share" / PACKAGE / "config" / name for prefix in prefixes if prefix]
     for place in places:
         if place.is_file():
@@ -168,7 +168,7 @@ def graph_environment(domain_id: int, log_dir: Path, graph_id: str = "") -> dict
         profile = str(config_file("fastdds_shm.xml"))
         own |= {"FASTRTPS_DEFAULT_PROFILES_FILE": profile, "FASTDDS_DEFAULT_PROFILES_FILE": profile}
     own.setdefault("AMENT_PREFIX_PATH", os.environ.get("AMENT_PREFIX_PATH", sys.prefix))
-    root = str(Path(__file__).resolve().parents[1])
+    root = str(Path(__file__).resolve().parents[2])
     path = os.environ.get("PYTHONPATH", "")
     own["PYTHONPATH"] = f"{root}{os.pathsep}{path}" if path else root
     defaults = {**_MEMORY, **dict.fromkeys(THREADS_OF_LIBRARIES, "1")}
@@ -271,7 +271,7 @@ def _exists(pid: int) -> bool:
 
 
 class ForkServer:
-    """Starts node processes from one that has loaded what they all need (`nodes.fork_server`).
+    """Starts node processes from one that has loaded what they all need (`nodes.runtime.fork_server`).
 
     Parameters
     ----------
@@ -293,7 +293,7 @@ class ForkServer:
             with log.open("ab") as output:
                 self._server = subprocess.Popen(
                     # The player needs little, and reads the bag while the others' kernels are loaded.
-                    [sys.executable, "-m", f"{PACKAGE}.nodes.fork_server", _START_ORDER[0]],
+                    [sys.executable, "-m", f"{PACKAGE}.nodes.runtime.fork_server", _START_ORDER[0]],
                     env=dict(environment),
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,

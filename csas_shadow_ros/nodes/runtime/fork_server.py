@@ -37,7 +37,7 @@ def load(node: str) -> Any:
     ImportError
         If there is no such node, or a library of it is missing.
     """
-    module = importlib.import_module(f"{__package__}.{node}")
+    module = importlib.import_module(f"..{node}", __package__)
     for kind in CsasNode.__subclasses__():
         if kind.name == node:
             kind.preload()

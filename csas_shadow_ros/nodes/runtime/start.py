@@ -28,7 +28,8 @@ def run(name: str) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         # Nothing has begun that would have to be brought to an end. `run_node` sets its own handlers.
         signal.signal(number, lambda *_: os._exit(0))
-    status: int = importlib.import_module(f"{__package__}.{name}").main()
+    nodes = __package__.rpartition(".")[0]
+    status: int = importlib.import_module(f"{nodes}.{name}").main()
     return status
 
 
