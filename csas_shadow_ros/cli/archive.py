@@ -1,0 +1,122 @@
+"""``csas-shadow batch``, ``catalogue`` and ``find``: many bags, and questions to them."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Callable
+
+from ..core.parameters import START_FROM
+from .console import OK, PARTIAL, Console
+from .options import objects_option, output_options, parameter_options, parameters_of
+
+
+def add_archive(add: Callable[..., argparse.ArgumentParser]) -> None:
+    """Add ``batch``, ``catalogue`` and ``find``."""
+    add(
+        "batch",
+        "process many bags into an archive, with a catalogue of what is in them",
+        "  csas-shadow batch runs/ --out season --workers 4\n"
+        "  csas-shadow batch 'runs/*_leg3' @more.txt --out season --step-deg 2 --redo failed\n"
+        "  csas-shadow batch runs/ --out season --scheduler tcp://cluster:8786\n\n"
+        "SOURCE is a bag, a folder of which every bag below is taken, a pattern, or @FILE with a line each.\n"
+        "What is done is not done again: the same command goes on after anything. A bag that fails is a row\n"
+        "of the catalogue and a line of failed.txt; exit code 3 says that there are such. Ctrl-C ends with\n"
+        "the bags that are being processed, a second one at once.",
+        _batch,
+        _batch_options,
+    )
+    catalogue = add(
+        "catalogue",
+        "make the catalogue of an archive anew, from the results that lie in it",
+        "  csas-shadow catalogue season\n\n"
+        "writes DIR/catalogue/runs.parquet and contacts.parquet; DIR may be any folder with results.",
+        _catalogue,
+    )
+    catalogue.add_argument("archive", metavar="DIR", help="an archive, or a folder of results")
+    output_options(catalogue)
+    find = add(
+        "find",
+        "ask the catalogue of an archive",
+        "  csas-shadow find season --where \"length_m > 1 and verdict == 'object'\"\n"
+        "  csas-shadow find season --near 48.36 -4.55 200 --where \"quality <> 'not trustworthy'\"\n"
+        "  csas-shadow find season --same\n"
+        "  csas-shadow find season --where \"status = 'failed'\" --json\n\n"
+        "the expression is SQL (DuckDB's) over the columns that docs/archive.md lists.",
+        _find,
+    )
+    find.add_argument("archive", metavar="DIR", help="an archive")
+    find.add_argument("--where", metavar="EXPRESSION", help="keep the rows for which it is true")
+    find.add_argument(
+        "--near", type=float, nargs=3, metavar=("LAT", "LON", "RADIUS"), help="in a circle (degrees, m)"
+    )
+    find.add_argument("--same", action="store_true", help="objects that are in several runs, numbered")
+    find.add_argument("--limit", type=int, metavar="N", help="at most so many rows (default: all)")
+    output_options(find)
+
+
+def _batch_options(p: argparse.ArgumentParser) -> None:
+    p.add_argument("sources", nargs="+", metavar="SOURCE", help="bag, folder, pattern, or @FILE of such")
+    p.add_argument("--out", required=True, metavar="ARCHIVE", help="archive to make, or to go on with")
+    p.add_argument(
+        "--redo",
+        action="append",
+        default=[],
+        choices=("failed", "changed", "all"),
+        help="do again what failed; what is of other content, parameters or version; all. May be repeated",
+    )
+    p.add_argument("--namespace", help="namespace of the bags' topics (found by itself)")
+    p.add_argument("--start-from", choices=START_FROM, default="auto", help="as of run (default auto)")
+    p.add_argument("--spectrum-sign", type=int, choices=(1, -1), help="instead of what the bags state")
+    p.add_argument("--bags", action="store_true", help="write result.mcap of each (it holds every view)")
+    p.add_argument("--figures", action="store_true", help="draw the figures of each")
+    p.add_argument("--no-sync", action="store_true", help="leave writing out to the disk to the system")
+    objects_option(p)
+    group = p.add_argument_group("workers")
+    group.add_argument(
+        "--workers", type=int, metavar="N", help="processes on this machine (default: one a processor)"
+    )
+    group.add_argument(
+        "--threads", type=int, metavar="N", help="of each (default: processors are shared; on a cluster 1)"
+    )
+    group.add_argument(
+        "--memory-gb",
+        type=float,
+        metavar="GB",
+        help="what each may take: a bag that needs more fails (default: 0.8 of the machine's memory, shared)",
+    )
+    group.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a dask.distributed cluster, tcp://HOST:PORT"
+    )
+    group.add_argument("--scheduler-file", metavar="FILE", help="the file that its scheduler wrote")
+    parameter_options(p)
+    output_options(p)
+
+
+def _batch(arguments: argparse.Namespace, console: Console) -> int:
+    from ..archive import command
+
+    options = command.options_of(arguments, parameters_of(arguments))
+    done = command.batch(arguments, options, quiet=console.quiet, notice=console.notice)
+    console.result(f"{done}\ncatalogue of {done.runs} runs: {arguments.out}", dataclasses.asdict(done))
+    if done.interrupted:
+        raise KeyboardInterrupt
+    return PARTIAL if done.failed else OK
+
+
+def _catalogue(arguments: argparse.Namespace, console: Console) -> int:
+    from ..archive.catalogue import rebuild
+
+    with console.bar("tasks") as bar:
+        runs = rebuild(arguments.archive, lambda done: bar(done, done))
+    console.result(f"catalogue of {runs} runs: {arguments.archive}", {"runs": runs})
+    return OK
+
+
+def _find(arguments: argparse.Namespace, console: Console) -> int:
+    from ..archive.command import find
+    from ..results.report import json_ready
+
+    rows, text = find(arguments)
+    console.result(text, json_ready(rows))
+    return OK
