@@ -2,7 +2,6 @@
 
 import os
 import sys
-from glob import glob
 from pathlib import Path
 
 from setuptools import find_packages, setup
@@ -102,7 +101,7 @@ def files_below(folder: str) -> list[tuple[str, list[str]]]:
     """Return data_files entries that keep a folder's layout below share/NAME."""
     found = []
     for path, _, _ in os.walk(folder):
-        files = sorted(f for f in glob(f"{path}/*") if os.path.isfile(f) and not f.endswith(".pyc"))
+        files = sorted(str(f) for f in Path(path).glob("*") if f.is_file() and f.suffix != ".pyc")
         if files and "__pycache__" not in path:
             found.append((f"share/{NAME}/{path}", files))
     return found

@@ -379,11 +379,11 @@ def draw_dependence(rows: Sequence[Row], path: Path) -> None:
     with mpl.rc_context(_STYLE):
         figure, axes = _figure(3, 2, 13.0, 7.5)
         along: list[tuple[str, Callable[[Row, BodyScore], float], bool]] = [
-            ("contrast (dB)", lambda r, b: r.contrast_db, False),
-            ("grazing angle (°)", lambda r, b: r.grazing_deg, False),
+            ("contrast (dB)", lambda r, _: r.contrast_db, False),
+            ("grazing angle (°)", lambda r, _: r.grazing_deg, False),
             ("length (cells)", lambda r, b: b.true_size["length_m"] / r.cell_m, True),
-            ("shadow (cells)", lambda r, b: b.shadow_cells, True),
-            ("echo (dB; none: -5)", lambda r, b: max(r.echo_db, -5.0), False),
+            ("shadow (cells)", lambda _, b: b.shadow_cells, True),
+            ("echo (dB; none: -5)", lambda r, _: max(r.echo_db, -5.0), False),
         ]
         for a, (text, value, log) in zip(axes.flat, along, strict=False):
             for flagged, colour, label in ((False, _TRUTH, "good"), (True, _FOUND, "flagged")):

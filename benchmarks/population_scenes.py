@@ -73,7 +73,7 @@ def _cone(rng: Rng) -> Parts:
     return [frustum(1.0, _uniform(rng, 0.0, 0.6), _uniform(rng, 0.3, 0.8))]
 
 
-def _sphere(rng: Rng) -> Parts:
+def _sphere(_: Rng) -> Parts:
     return [ellipsoid((1.0, 1.0, 1.0))]
 
 
@@ -570,7 +570,7 @@ def draw(half: str, index: int) -> SceneSpec:
     return _draw_run(rng, half, index, complications, bodies, clutter)
 
 
-def _draw_body(rng: Rng, half: str, family: str, size_m: float, chosen: Iterable[str]) -> Body:
+def _draw_body(rng: Rng, family: str, size_m: float, chosen: Iterable[str]) -> Body:
     tilted = "tilted" in chosen
     buried = _uniform(rng, 0.1, 0.7) if "buried" in chosen else _uniform(rng, 0.05, 0.25) if tilted else 0.0
     return Body(
@@ -601,7 +601,7 @@ def _draw_bodies(
     family = names[number % len(names)]
     low, high = FAMILIES[half][family].size_m
     size = _log_uniform(rng, low, high)
-    main = _draw_body(rng, half, family, size, chosen)
+    main = _draw_body(rng, family, size, chosen)
     off = 0.1 * size if rng.uniform() < 0.5 else size
     main = _moved(main, _uniform(rng, -off, off), _uniform(rng, -off, off))
     taken = [(main.place_m, _reach_m(main))]
@@ -622,12 +622,12 @@ def _draw_bodies(
     if "bodies" in chosen:
         for _ in range(int(rng.integers(1, 3))):
             other = names[int(rng.integers(len(names)))]
-            body = _draw_body(rng, half, other, _uniform(rng, 0.5, 1.0) * size, ())
+            body = _draw_body(rng, other, _uniform(rng, 0.5, 1.0) * size, ())
             bodies.append(beside(body, (0.15, 1.0)))
     if "clutter" in chosen:
         kind = "rock" if half == DEVELOPMENT else "boulders"
         for _ in range(int(rng.integers(2, 6))):
-            body = _draw_body(rng, half, kind, _uniform(rng, 0.06, 0.18) * size, ())
+            body = _draw_body(rng, kind, _uniform(rng, 0.06, 0.18) * size, ())
             clutter.append(beside(body, (0.1, 1.2)))
     return tuple(bodies), tuple(clutter)
 

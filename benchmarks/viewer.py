@@ -121,7 +121,7 @@ def spread(values: list[float]) -> dict[str, float]:
     return {"median": round(float(np.median(values)), 1), "p95": round(float(np.percentile(values, 95)), 1)}
 
 
-def memory_mb(browser: Any, page: Any) -> float:
+def memory_mb(browser: Any) -> float:
     """Return the resident memory of the renderer processes (Linux), MB."""
     cdp = browser.new_browser_cdp_session()
     processes = cdp.send("SystemInfo.getProcessInfo")["processInfo"]
@@ -202,7 +202,7 @@ def measure(store: ViewStore) -> dict[str, Any]:
             watched.open(server.url)
             out["first_picture_ms"] = round(watched.js("csas.stats.first"))
             watched.until("csas.loader.all.length === 0 && csas.loader.busy.size === 0", 300)
-            out["memory_mb_all_views_loaded"] = round(memory_mb(browser, watched.page))
+            out["memory_mb_all_views_loaded"] = round(memory_mb(browser))
             out["scrub"] = scrub(watched, port)
             watched.js("csas.panels[1].choose('six_shadow')")
             watched.until("csas.panels[1].sixWanted?.every(a => csas.loader.bitmap(a))")
@@ -241,7 +241,7 @@ def opened(results: Path) -> dict[str, Any]:
                 watched.until("csas.scene.volumes.main && csas.loader.all.length === 0", 300)
                 watched.until("csas.loader.busy.size === 0", 300)
                 out["views"] = watched.js("csas.views('shadow').length")
-                out["memory_mb_all_views_loaded"] = round(memory_mb(browser, page))
+                out["memory_mb_all_views_loaded"] = round(memory_mb(browser))
             finally:
                 server.terminate()
     return out

@@ -125,7 +125,7 @@ class Expectation:
 
 
 def read_expectations(path: str | Path) -> tuple[Expectation, ...]:
-    """Read what is expected from a YAML file.
+    r"""Read what is expected from a YAML file.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ def progress_bar(option: ProgressOption, what: str) -> Iterator[Callable[[int, i
     notebook = in_notebook()
     wanted = option if option is not None else notebook or sys.stderr.isatty()
     if not wanted:
-        yield lambda done, total: None
+        yield lambda *_: None
         return
     widgets = notebook and importlib.util.find_spec("ipywidgets") is not None
     library = importlib.import_module("tqdm.notebook" if widgets else "tqdm")

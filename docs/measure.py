@@ -179,7 +179,7 @@ def _mixture(local: LocalMeans, start_db: float) -> tuple[float, float] | None:
 #: What segmentation and levels do, each left out or done otherwise in turn.
 VIEWS_WITHOUT: dict[str, tuple[Any, dict[str, Any]]] = {
     "  square averaging box": (segmentation, {"_HALF_CELLS": (1.0, 1.0)}),
-    "  far end not put back": (segmentation, {"_drawn_down": lambda dark, rows: dark}),
+    "  far end not put back": (segmentation, {"_drawn_down": lambda dark, _: dark}),
     "  contrast hypothesis alone": (likelihood, {"fit_contrast": lambda *_: None}),
     "  levels by a mixture fit": (likelihood, {"fit_contrast": _mixture}),
 }

@@ -80,6 +80,26 @@ def track_from_msg(msg: Any, max_gap_rad: float = DEFAULT_MAX_GAP_RAD) -> Track:
         raise AdapterError(f"track.poses: {error}") from error
 
 
+def _bad_places(positions: NDArray[np.float64]) -> dict[int, str]:
+    """Return the poses that are at no place a sonar can be, and why, by number."""
+    bad: dict[int, str] = {}
+    for i in np.flatnonzero(~np.isfinite(positions).all(axis=1)).tolist():
+        bad[i] = f"track pose {i} is {_brief(positions[i])}; expected finite metres"
+    for i in np.flatnonzero((np.abs(positions) > MAX_COORDINATE_M).any(axis=1)).tolist():
+        bad.setdefault(
+            i,
+            f"track pose {i} is at {_brief(positions[i])} m; expected coordinates of at most"
+            f" {MAX_COORDINATE_M:.6g} m",
+        )
+    for i in np.flatnonzero(positions[:, 2] <= 0.0).tolist():
+        bad.setdefault(
+            i, f"track pose {i} is at z = {positions[i, 2]:g} m; expected above the seabed (z > 0)"
+        )
+    for i in np.flatnonzero(np.hypot(positions[:, 0], positions[:, 1]) < 1e-9).tolist():
+        bad.setdefault(i, f"track pose {i} is over the scene's origin: no aspect there")
+    return bad
+
+
 def track_piece_from_msg(msg: Any) -> TrackPiece:
     """Read a Path as poses of a run, whole or in part; orientations are not used.
 
@@ -105,22 +125,8 @@ def track_piece_from_msg(msg: Any) -> TrackPiece:
     if not n:
         raise AdapterError("track.poses: track has 0 poses; expected at least 1")
     header_ns = stamp_to_ns(msg.header.stamp, "track.header.stamp")
-    bad: dict[int, str] = {}
-    for i in np.flatnonzero(~np.isfinite(positions).all(axis=1)).tolist():
-        bad[i] = f"track pose {i} is {_brief(positions[i])}; expected finite metres"
-    for i in np.flatnonzero((np.abs(positions) > MAX_COORDINATE_M).any(axis=1)).tolist():
-        bad.setdefault(
-            i,
-            f"track pose {i} is at {_brief(positions[i])} m; expected coordinates of at most"
-            f" {MAX_COORDINATE_M:.6g} m",
-        )
+    bad = _bad_places(positions)
     low = np.flatnonzero(positions[:, 2] <= 0.0)
-    for i in low.tolist():
-        bad.setdefault(
-            i, f"track pose {i} is at z = {positions[i, 2]:g} m; expected above the seabed (z > 0)"
-        )
-    for i in np.flatnonzero(np.hypot(positions[:, 0], positions[:, 1]) < 1e-9).tolist():
-        bad.setdefault(i, f"track pose {i} is over the scene's origin: no aspect there")
     good = [i for i in range(n) if i not in bad]
     times = stamps.tolist()
     last = -1

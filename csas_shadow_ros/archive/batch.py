@@ -148,7 +148,7 @@ class _Stop:
         finally:
             signal.signal(signal.SIGINT, before)
 
-    def _hear(self, number: int, frame: FrameType | None) -> None:
+    def _hear(self, _: int, __: FrameType | None) -> None:
         self.times += 1
 
 

@@ -136,7 +136,7 @@ class Archive:
     """
 
     def __init__(self, root: str | Path) -> None:
-        self.root = Path(os.path.abspath(root))
+        self.root = Path(os.path.abspath(root))  # noqa: PTH100  (a link stays one)
         self.catalogue = self.root / CATALOGUE
         self.parts = self.root / PARTS
         self.failed = self.root / FAILED
@@ -218,7 +218,7 @@ def _alone(path: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):  # file systems without locks
             fcntl.flock(number, fcntl.LOCK_EX)
         with contextlib.suppress(FileNotFoundError):
-            if os.stat(path).st_ino == os.fstat(number).st_ino:
+            if path.stat().st_ino == os.fstat(number).st_ino:
                 break
         os.close(number)  # who held it has removed it
     try:

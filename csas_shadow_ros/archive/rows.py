@@ -190,6 +190,7 @@ def _base(record: Record, part: PartOfTask) -> dict[str, Any]:
 def rows_of_report(
     report: Mapping[str, Any], base: Mapping[str, Any], results: str
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the row of a run, and those of its contacts, of its report."""
     quality, views, given = report["quality"], report["views"], report.get("input") or {}
     run_ns = report.get("run")
     track = given.get("track") or {}

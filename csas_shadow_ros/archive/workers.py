@@ -101,7 +101,7 @@ def memory_bytes() -> int:
     return min(found)
 
 
-def _begin(memory: int, threads: int) -> None:
+def _begin(memory: int, _: int) -> None:
     """Prepare a worker: bounded memory, no Ctrl-C of its own, and an end when the batch is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the batch decides what becomes of the tasks
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -233,7 +233,7 @@ class LocalWorkers(Executor):
         for slot in self._slots:
             slot.end(now=now)
 
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: ARG002
         """End the processes, as `concurrent.futures` has it."""
         self.end(now=not wait)
 
@@ -313,7 +313,7 @@ class ClusterWorkers:
             f"scheduler {self._where} is gone; what is done is kept, the same command goes on"
         )
 
-    def end(self, *, now: bool) -> None:
+    def end(self, *, now: bool) -> None:  # noqa: ARG002  (as the local one has it)
         """Leave the cluster; it goes on without us."""
         with contextlib.suppress(Exception):
             self._client.close(timeout=2.0)

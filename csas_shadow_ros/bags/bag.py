@@ -660,7 +660,7 @@ class BagWriter:
 class _PlainDumper(yaml.SafeDumper):
     """Writes equal parts out: not every reader of metadata knows YAML's anchors."""
 
-    def ignore_aliases(self, data: Any) -> bool:
+    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002  (PyYAML's)
         return True
 
 

@@ -106,28 +106,35 @@ class McapFile:
         except OSError as error:
             raise BagError(f"cannot read {path}: {error.strerror}") from error
 
-    def _read_summary(self, file: BinaryIO) -> bool:
-        """Learn channels, counts and places from the file's index; say whether it tells all of them."""
+    def _summary_of(self, file: BinaryIO) -> tuple[bytes, int] | None:
+        """Return the file's summary and its checksum; None if there is none to be trusted."""
         if self.size < len(MAGIC) + _FOOTER_BYTES:
             self._cut_short("before its first message")
-            return False
+            return None
         file.seek(-_FOOTER_BYTES, io.SEEK_END)
         tail = file.read(_FOOTER_BYTES)
         op, length, start, _, crc = struct.unpack("<BQQQI", tail[:29])
         if tail[29:] != MAGIC or op != _FOOTER or length != 20:
             self._cut_short("its footer is missing: the recording was cut off")
-            return False
+            return None
         if start == 0:
-            return False  # written without a summary: not an error, the records are walked
+            return None  # written without a summary: not an error, the records are walked
         end = self.size - _FOOTER_BYTES
         if not len(MAGIC) <= start <= end:
             self._cut_short(f"its summary is said to start at byte {start} of {self.size}")
-            return False
+            return None
         file.seek(start)
         summary = file.read(end - start)
         if crc and zlib.crc32(summary + tail[:25]) != crc:
             self._cut_short("the checksum of its summary is wrong")
+            return None
+        return summary, crc
+
+    def _read_summary(self, file: BinaryIO) -> bool:
+        """Learn channels, counts and places from the file's index; say whether it tells all of them."""
+        if (found := self._summary_of(file)) is None:
             return False
+        summary, crc = found
         statistics: Statistics | None = None
         chunks: list[ChunkIndex] = []
         try:
@@ -217,6 +224,13 @@ class McapFile:
         if not self.complete:
             self._complain(f"{self.name}: {sum(self.counts.values())} messages recovered")
 
+    def _end_of_data(self, file: BinaryIO, running: int, loose: bool) -> None:
+        """Compare the checksum of all data, if the writer made one."""
+        (crc,) = struct.unpack("<I", file.read(4).ljust(4, b"\0"))
+        if crc and crc != running:
+            self._complain(f"{self.name}: the checksum of its data is wrong: some bits have changed")
+        self.has_checksums &= bool(crc) or not loose
+
     def _walk(self, file: BinaryIO) -> Iterator[tuple[int, int, memoryview]]:
         """Iterate chunks and messages outside of chunks, from the start as far as the records go."""
         file.seek(len(MAGIC))
@@ -232,12 +246,8 @@ class McapFile:
                 self._complain(f"{self.name}: ends in the middle of a record at byte {offset} ({error})")
                 return
             if op == _DATA_END:
-                (crc,) = struct.unpack("<I", file.read(4).ljust(4, b"\0"))
-                if crc and crc != running:
-                    self._complain(f"{self.name}: the checksum of its data is wrong: some bits have changed")
-                self.has_checksums &= bool(crc) or not loose
-                return
-            if op == _FOOTER:
+                self._end_of_data(file, running, loose)
+            if op in (_DATA_END, _FOOTER):
                 return
             if op not in _KNOWN and op < _FREE_TYPES:
                 self.complete = False

@@ -24,7 +24,7 @@ def add_warm(add: Callable[..., argparse.ArgumentParser]) -> None:
     output_options(warm)
 
 
-def _warm(arguments: argparse.Namespace, console: Console) -> int:
+def _warm(_: argparse.Namespace, console: Console) -> int:
     from ..core import kernels
     from ..core.warm import warm_all
     from ..simulation.warm import warm_simulation

@@ -62,8 +62,9 @@ def _places() -> Iterator[Place]:
         yield Place("NUMBA_CACHE_DIR", Path(given).absolute())
     yield Place("package", package_folder())
     # A user without an entry in passwd has no home: "~" then stays what it is.
-    for base in (os.environ.get("XDG_CACHE_HOME", ""), os.path.expanduser("~/.cache")):
-        if os.path.isabs(base):
+    home = os.path.expanduser("~/.cache")  # noqa: PTH111  (Path's raises)
+    for base in (os.environ.get("XDG_CACHE_HOME", ""), home):
+        if Path(base).is_absolute():
             yield Place("user cache", Path(base) / _NAME / "kernels")
     with contextlib.suppress(OSError):  # there is no folder for temporary files
         yield Place("temporary folder", Path(tempfile.gettempdir()) / f"{_NAME}-{os.geteuid()}")

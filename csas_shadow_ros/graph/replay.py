@@ -559,7 +559,7 @@ def _shown(progress: Callable[[int, int], None] | bool) -> Iterator[Callable[[in
         yield progress
         return
     if not progress:
-        yield lambda done, total: None
+        yield lambda *_: None
         return
     from tqdm import tqdm
 

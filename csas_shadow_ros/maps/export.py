@@ -90,7 +90,7 @@ def export_result(
         if name not in FORMATS:
             raise ParameterError(f"format is {name!r}; expected one of: {', '.join(FORMATS)}")
     source = MapSource(result, place)
-    folder = Path(os.path.abspath(out))
+    folder = Path(os.path.abspath(out))  # noqa: PTH100  (a link stays one)
     done = Exported(str(folder))
     for name in _ON_EARTH if source.datum is None else ():
         why = (

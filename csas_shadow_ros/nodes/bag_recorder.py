@@ -239,23 +239,29 @@ class BagRecorderNode(CsasNode):
             self.counts["dropped"] += 1
             self._dropped.add(topic)
             return
-        newest = self._bags[-1]
         if topic in _STANDING:
             self._standing.append((topic, when, cdr))
             for bag in self._bags:
                 self._write(bag, topic, cdr, when)
-            return
-        if topic == "track":
-            name = self._learn(cdr)
-            if newest.run_ns is None:
-                newest.run_ns = name
-            for bag in self._bags:
-                if bag.run_ns == name:
-                    self._write(bag, topic, cdr, when)
-                    return
-            self._tracks.setdefault(name, []).append((when, cdr))
-            self._place_again()
-            return
+        elif topic == "track":
+            self._take_track(cdr, when)
+        else:
+            self._take_of_run(topic, cdr, when, late=late)
+
+    def _take_track(self, cdr: bytes, when: int) -> None:
+        """Write a track into its run's bag, or keep it until that begins."""
+        name = self._learn(cdr)
+        if self._bags[-1].run_ns is None:
+            self._bags[-1].run_ns = name
+        for bag in self._bags:
+            if bag.run_ns == name:
+                self._write(bag, "track", cdr, when)
+                return
+        self._tracks.setdefault(name, []).append((when, cdr))
+        self._place_again()
+
+    def _take_of_run(self, topic: str, cdr: bytes, when: int, *, late: bool) -> None:
+        """Write what has a stamp into the bag of its run, which it may begin."""
         stamp = None if topic in _NEVER_ALIKE else message_stamp(cdr, topic)
         run_ns = None if stamp is None else self._book.run_of(stamp)
         if run_ns is None and topic in _BEGIN_A_RUN and self._book.names and not late:
@@ -269,8 +275,8 @@ class BagRecorderNode(CsasNode):
                 self._write(bag, topic, cdr, when)
                 break
         else:
-            bag = newest
-            if run_ns is not None and newest.run_ns is not None:
+            bag = self._bags[-1]
+            if run_ns is not None and bag.run_ns is not None:
                 bag = self._begin_run(run_ns)
             self._write(bag, topic, cdr, when)
         if topic in _ENDS_THE_RUN_BEFORE:

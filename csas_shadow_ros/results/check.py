@@ -6,7 +6,7 @@ import dataclasses
 import json
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -86,6 +86,26 @@ def looks_like_results(path: str | Path) -> bool:
     return any((folder / name).exists() for name in (REPORT, CHECKSUMS, GRID))
 
 
+def _check_report(base: Path, check: ResultsCheck, error: Callable[..., None]) -> set[str]:
+    """Look at the report itself, and at what it says that failed; return the files that it names."""
+    try:
+        report = json.loads(_read(base / REPORT))
+    except (OSError, ValueError, RecursionError) as wrong:
+        error(REPORT, f"cannot be read: {wrong}")
+        return set()
+    if not isinstance(report, dict) or report.get("format") != FORMAT:
+        told = report.get("format") if isinstance(report, dict) else type(report).__name__
+        error(REPORT, f"its format is {told!r}; expected {FORMAT!r}, which csas-shadow {__version__} reads")
+        return set()
+    versions = report.get("versions")
+    check.version = str(versions.get("csas_shadow_ros", "")) if isinstance(versions, dict) else ""
+    failed = report.get("failed")
+    for part, why in failed.items() if isinstance(failed, dict) else ():
+        error(REPORT, f"the run could not make {part}: {why}", "warning")
+    files = report.get("files")
+    return {str(name) for name in files} if isinstance(files, list) else set()
+
+
 def check_results(folder: str | Path) -> ResultsCheck:
     """Compare every file of a results folder with what was written.
 
@@ -116,23 +136,7 @@ def check_results(folder: str | Path) -> ResultsCheck:
     def error(name: str, problem: str, level: str = "error") -> None:
         check.findings.append(FileFinding(level, name, problem))
 
-    report: Any = None
-    try:
-        report = json.loads(_read(base / REPORT))
-        if not isinstance(report, dict) or report.get("format") != FORMAT:
-            told = report.get("format") if isinstance(report, dict) else type(report).__name__
-            error(
-                REPORT, f"its format is {told!r}; expected {FORMAT!r}, which csas-shadow {__version__} reads"
-            )
-            report = None
-    except (OSError, ValueError, RecursionError) as wrong:
-        error(REPORT, f"cannot be read: {wrong}")
-    if report is not None:
-        versions = report.get("versions")
-        check.version = str(versions.get("csas_shadow_ros", "")) if isinstance(versions, dict) else ""
-        failed = report.get("failed")
-        for part, why in failed.items() if isinstance(failed, dict) else ():
-            error(REPORT, f"the run could not make {part}: {why}", "warning")
+    named = _check_report(base, check, error)
     try:
         listed = dict(_sums(_read(base / CHECKSUMS)))
     except (OSError, ValueError) as wrong:
@@ -157,9 +161,8 @@ def check_results(folder: str | Path) -> ResultsCheck:
                 error(name, "has changed: its SHA-256 is another")
     for name in sorted(set(there) - set(listed) - {CHECKSUMS, *BY_HAND}):
         error(name, "is not listed: it was not written with the results")
-    if report is not None and isinstance(report.get("files"), list):
-        for name in sorted({str(n) for n in report["files"]} - set(listed) - {CHECKSUMS}):
-            error(name, f"is named by {REPORT}, but not listed in {CHECKSUMS}")
+    for name in sorted(named - set(listed) - {CHECKSUMS}):
+        error(name, f"is named by {REPORT}, but not listed in {CHECKSUMS}")
     return _sorted(check)
 
 
@@ -188,7 +191,7 @@ def _sums(text: str) -> Iterator[tuple[str, str]]:
 def _files(folder: Path) -> Iterator[tuple[str, str]]:
     """Give the name of each entry that is no folder, and what it is if no plain file; follow no link."""
     for place, folders, names in os.walk(folder):
-        links = [name for name in folders if os.path.islink(os.path.join(place, name))]
+        links = [name for name in folders if Path(place, name).is_symlink()]
         for name in [*names, *links]:
             path = Path(place, name)
             mode = path.lstat().st_mode

@@ -55,7 +55,7 @@ _STYLE: dict[str, Any] = {
 }
 
 
-class _Missing(CsasError):
+class _MissingError(CsasError):
     """A figure cannot be drawn of this run; the message says what is missing."""
 
 
@@ -120,7 +120,7 @@ def decibels(amplitude: NDArray[Any]) -> NDArray[np.float32]:
     magnitude = np.abs(amplitude).astype(np.float32)
     known = magnitude[np.isfinite(magnitude) & (magnitude > 0)]
     if not known.size:
-        raise _Missing("no pixel is known")
+        raise _MissingError("no pixel is known")
     floor = np.float32(1e-6) * known.max()
     with np.errstate(invalid="ignore"):
         return np.asarray(20.0 * np.log10(np.maximum(magnitude, floor) / np.median(known)), np.float32)
@@ -133,7 +133,7 @@ def _scene_circle(subject: Subject) -> tuple[tuple[float, float], float]:
         return subject.image.grid.centre_m, 0.5 * min(right - left, top - bottom)
     views = subject.keeper.of("shadow") or subject.keeper.of("sub_aperture")
     if not views:
-        raise _Missing("there is no view that shows the scene")
+        raise _MissingError("there is no view that shows the scene")
     camera = views[0].info.camera
     middle = camera.pixel_to_ground[:2] @ np.array([(camera.cols - 1) / 2.0, (camera.rows - 1) / 2.0, 1.0])
     known = float(np.isfinite(views[0].pixels).sum()) * camera.spacing_m[0] * camera.spacing_m[1]
@@ -187,7 +187,7 @@ def figure_1b(subject: Subject) -> Figure:
     """Draw the multi-look image."""
     composites = subject.result.composites
     if composites is None:
-        raise _Missing("there are no composites: the run starts after the sub-apertures")
+        raise _MissingError("there are no composites: the run starts after the sub-apertures")
     db = decibels(composites.multilook())
     figure = _new(7.4, 6.2)
     axes = figure.add_subplot()
@@ -212,7 +212,7 @@ def figure_1c(subject: Subject) -> Figure:
     """Draw the colour-by-aspect image with its wheel of colours."""
     composites = subject.result.composites
     if composites is None:
-        raise _Missing("there are no composites: the run starts after the sub-apertures")
+        raise _MissingError("there are no composites: the run starts after the sub-apertures")
     figure = _new(8.2, 6.2)
     parts = figure.add_gridspec(1, 2, width_ratios=[4.2, 1.2])
     axes = figure.add_subplot(parts[0])
@@ -238,7 +238,7 @@ def figure_2a(subject: Subject) -> Figure:
     """Draw the image's 2-D spectrum with the wedge of one sub-aperture."""
     image, track = subject.image, subject.track
     if image is None or track is None:
-        raise _Missing("there is no full-circle image, so no spectrum")
+        raise _MissingError("there is no full-circle image, so no spectrum")
     spectrum = Spectrum.of_image(image)
     power = np.fft.fftshift(np.square(np.abs(spectrum.values)))
     # Averaged to a size that a figure shows: speckle of single bins would only look grey.
@@ -303,7 +303,7 @@ def figure_2b(subject: Subject) -> Figure:
     """Draw one sub-aperture inside the circular slider."""
     views = subject.keeper.of("sub_aperture")
     if not views:
-        raise _Missing("there are no sub-aperture views of this run")
+        raise _MissingError("there are no sub-aperture views of this run")
     view = views[1 if len(views) > 1 else 0]
     centre, radius = _scene_circle(subject)
     figure = _new(6.6, 6.0)
@@ -317,7 +317,7 @@ def figure_2b(subject: Subject) -> Figure:
 def _six(subject: Subject, stage: str, heading: str) -> Figure:
     views = subject.keeper.of(stage)
     if not views:
-        raise _Missing(f"there are no {stage} views of this run")
+        raise _MissingError(f"there are no {stage} views of this run")
     centre, radius = _scene_circle(subject)
     cols = min(3, len(views))
     rows = math.ceil(len(views) / cols)
@@ -349,7 +349,7 @@ def _example(subject: Subject) -> ProcessedView:
     """Return the kept view with the largest segmented shadow."""
     views = [v for v in subject.keeper.views() if v.shadow is not None and v.mask is not None]
     if not views or subject.result.target is None:
-        raise _Missing("there is no target, so no shadow to look at")
+        raise _MissingError("there is no target, so no shadow to look at")
 
     def dark(view: ProcessedView) -> int:
         return 0 if view.mask is None else int((view.mask.pixels == MASK_SHADOW).sum())
@@ -377,7 +377,7 @@ def _around_target(subject: Subject, view: View) -> tuple[float, float, float, f
     """Return the part of the view frame, about the target (m), in which its shadow lies."""
     target, dimensions = subject.result.target, subject.result.dimensions
     if target is None:
-        raise _Missing("there is no target, so no shadow to look at")
+        raise _MissingError("there is no target, so no shadow to look at")
     across = 0.5 * math.hypot(target.size_m[0], target.size_m[1])
     height = dimensions.height_m if dimensions is not None else target.size_m[2]
     length = height / math.tan(view.info.camera.grazing_rad)
@@ -387,7 +387,7 @@ def _around_target(subject: Subject, view: View) -> tuple[float, float, float, f
 def _show_view(axes: Any, subject: Subject, view: View, pixels: Any, title: str, **style: Any) -> Any:
     target = subject.result.target
     if target is None:
-        raise _Missing("there is no target, so no shadow to look at")
+        raise _MissingError("there is no target, so no shadow to look at")
     shown = axes.imshow(pixels, extent=view_extent(view, target.position_m), **style)
     left, right, near, far = _around_target(subject, view)
     axes.set_xlim(left, right)
@@ -404,7 +404,7 @@ def figure_5(subject: Subject) -> Figure:
     shadow, full = example.shadow, example.sub_aperture
     image, track, target = subject.image, subject.track, subject.result.target
     if image is None or track is None or shadow is None or full is None or target is None:
-        raise _Missing("there is no full-circle image to make a reduced sub-aperture of")
+        raise _MissingError("there is no full-circle image to make a reduced sub-aperture of")
     width = min(_REDUCED_DEG, subject.parameters.sub_aperture.aperture_deg)
     narrow = replace(subject.parameters.sub_aperture, aperture_deg=width)
     reduced = SubApertures(image, track, narrow).view_of_aspect(full.info.aspect_rad)
@@ -434,7 +434,7 @@ def figure_7(subject: Subject) -> Figure:
     example = _example(subject)
     shadow, mask = example.shadow, example.mask
     if shadow is None or mask is None:
-        raise _Missing("there is no segmented shadow of this run")
+        raise _MissingError("there is no segmented shadow of this run")
     left, right, near, far = _around_target(subject, shadow)
     figure = _new(10.4, 1.8 + 4.2 * min(max((far - near) / (right - left), 0.6), 2.2))
     a, b = figure.subplots(1, 2, sharey=True)
@@ -521,7 +521,7 @@ def figure_8(subject: Subject) -> Figure:
         if mesh is not None:
             solids.append((titles.get(grid.method, f"{grid.method} carving"), mesh, False))
     if not solids:
-        raise _Missing("there is no object, so no surface")
+        raise _MissingError("there is no object, so no surface")
     truth = subject.truth if subject.truth is not None and len(subject.truth.faces) else None
     if truth is not None:
         solids.append(("truth", truth, True))

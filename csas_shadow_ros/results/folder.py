@@ -89,7 +89,7 @@ class ResultsWriter:
         durable: bool = True,
         notice: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self.folder = Path(os.path.abspath(folder))
+        self.folder = Path(os.path.abspath(folder))  # noqa: PTH100  (a link stays one)
         self._overwrite, self._durable = overwrite, durable
         self._place = Place(self.folder)
         self._place.clear(notice)

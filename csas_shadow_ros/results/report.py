@@ -465,6 +465,65 @@ def _sides(d: Mapping[str, Any]) -> str:
     return f"{d['length_m']:.3f} x {d['width_m']:.3f} x {d['height_m']:.3f} m"
 
 
+def _size_lines(mine: Mapping[str, Any], true: Mapping[str, Any]) -> list[str]:
+    """Write the table of sizes, found and true."""
+    intervals = mine.get("intervals") or {}
+    sure = f"{'95 %':>12}" if intervals else ""
+    lines = [f"{'':<14}{'found':>12}{sure}" + (f"{'truth':>12}{'difference':>12}" if true else "")]
+    rows = (
+        ("length", "length_m", "m"),
+        ("width", "width_m", "m"),
+        ("height", "height_m", "m"),
+        ("volume", "volume_m3", "m³"),
+        ("heading", "heading_deg", "°"),
+        ("position x", 0, "m"),
+        ("position y", 1, "m"),
+    )
+    for label, key, unit in rows:
+        values = [d["position_m"][key] if isinstance(key, int) else d[key] for d in (mine, true) if d]
+        digits = 1 if unit == "°" else 4 if unit == "m³" else 3
+        cells = [
+            "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f} {unit}"  # no -0
+            for value in values
+        ]
+        if not mine:
+            cells.insert(0, "-")
+        if intervals:
+            name = {0: "position_x_m", 1: "position_y_m", "heading_deg": "heading_rad"}.get(key, key)
+            low, high = intervals.get(name, (math.nan, math.nan))
+            half = (high - low) / 2.0 * (180.0 / math.pi if name == "heading_rad" else 1.0)
+            cells.insert(1, f"± {half:.{digits}f} {unit}")
+        line = f"{label:<14}" + "".join(f"{cell:>12}" for cell in cells)
+        if mine and true and None not in values:
+            off = values[0] - values[1]
+            if unit == "°":
+                off = (off + 90.0) % 180.0 - 90.0
+            line += f"{off:>+{12 - len(unit) - 1}.{digits}f} {unit}"
+        lines.append(line)
+    return lines
+
+
+def _object_lines(report: Mapping[str, Any]) -> list[str]:
+    """Write a line for each further object, and for each body that is none."""
+    lines = []
+    # Reports of before this entry have none.
+    for entry in report.get("objects", []):
+        if entry["files"][0] == "grid.npz":
+            continue  # the target: told above
+        d = entry["dimensions"]
+        x, y = d["position_m"]
+        lines.append(
+            f"object {entry['number']}: {_sides(d)}, {d['volume_m3']:.4f} m³,"
+            f" heading {d['heading_deg']:.1f}°, at ({x + 0.0:.2f}, {y + 0.0:.2f}) m,"
+            f" {entry['views_used']} views"
+            + ("" if (t := entry.get("truth")) is None else f"; in truth {_sides(t)}")
+        )
+    for left in report.get("objects_left_out", []):
+        x, y = left["position_m"]
+        lines.append(f"no object at ({x + 0.0:.2f}, {y + 0.0:.2f}) m: {left['reason']}")
+    return lines
+
+
 def summary(report: Mapping[str, Any]) -> str:
     """Write the short table that is printed and kept as ``summary.txt``."""
     truth = report["truth"] or {}
@@ -477,40 +536,7 @@ def summary(report: Mapping[str, Any]) -> str:
     elif truth and bool(mine) != truth["object"]:
         lines[0] += " (in truth there is one)" if truth["object"] else " (in truth there is none)"
     if mine or true:
-        intervals = mine.get("intervals") or {}
-        sure = f"{'95 %':>12}" if intervals else ""
-        lines.append(f"{'':<14}{'found':>12}{sure}" + (f"{'truth':>12}{'difference':>12}" if true else ""))
-        rows = (
-            ("length", "length_m", "m"),
-            ("width", "width_m", "m"),
-            ("height", "height_m", "m"),
-            ("volume", "volume_m3", "m³"),
-            ("heading", "heading_deg", "°"),
-            ("position x", 0, "m"),
-            ("position y", 1, "m"),
-        )
-        for label, key, unit in rows:
-            values = [d["position_m"][key] if isinstance(key, int) else d[key] for d in (mine, true) if d]
-            digits = 1 if unit == "°" else 4 if unit == "m³" else 3
-            cells = [
-                "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f} {unit}"  # no -0
-                for value in values
-            ]
-            if not mine:
-                cells.insert(0, "-")
-            if intervals:
-                name = {0: "position_x_m", 1: "position_y_m", "heading_deg": "heading_rad"}.get(key, key)
-                low, high = intervals.get(name, (math.nan, math.nan))
-                half = (high - low) / 2.0 * (180.0 / math.pi if name == "heading_rad" else 1.0)
-                cells.insert(1, f"± {half:.{digits}f} {unit}")
-            line = f"{label:<14}" + "".join(f"{cell:>12}" for cell in cells)
-            if mine and true and None not in values:
-                off = values[0] - values[1]
-                if unit == "°":
-                    off = (off + 90.0) % 180.0 - 90.0
-                line += f"{off:>+{12 - len(unit) - 1}.{digits}f} {unit}"
-            lines.append(line)
-        lines.append("")
+        lines += [*_size_lines(mine, true), ""]
     # Reports of before these entries have none.
     for entry in report.get("objects", []):
         if entry.get("place"):
@@ -540,21 +566,7 @@ def summary(report: Mapping[str, Any]) -> str:
     if grid:
         threshold = "none" if grid["threshold"] is None else f"{grid['threshold']:.4f}"
         lines.append(f"{grid['method']} carving, voxels of {grid['voxel_size_m']:g} m, threshold {threshold}")
-    # Reports of before this entry have none.
-    for entry in report.get("objects", []):
-        if entry["files"][0] == "grid.npz":
-            continue  # the target: told above
-        d = entry["dimensions"]
-        x, y = d["position_m"]
-        lines.append(
-            f"object {entry['number']}: {_sides(d)}, {d['volume_m3']:.4f} m³,"
-            f" heading {d['heading_deg']:.1f}°, at ({x + 0.0:.2f}, {y + 0.0:.2f}) m,"
-            f" {entry['views_used']} views"
-            + ("" if (t := entry.get("truth")) is None else f"; in truth {_sides(t)}")
-        )
-    for left in report.get("objects_left_out", []):
-        x, y = left["position_m"]
-        lines.append(f"no object at ({x + 0.0:.2f}, {y + 0.0:.2f}) m: {left['reason']}")
+    lines += _object_lines(report)
     lines.append(
         f"views: {views['in']} in, {views['used']} in the grid, {views['rejected']} not used,"
         f" {views['lost']} lost"

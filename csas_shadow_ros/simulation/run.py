@@ -237,8 +237,10 @@ def _smooth_round_circle(rng: np.random.Generator, modes: int) -> Callable[[Any]
 
 
 class _Orbit:
-    """True sonar position at each aspect: the circle (or what the faults make of it), and smooth departures
-    in range and height."""
+    """True sonar position at each aspect: the circle, and smooth departures in range and height.
+
+    The circle is what the faults make of it.
+    """
 
     def __init__(
         self,

@@ -132,8 +132,10 @@ def tyre(outer_diameter_m: float = 0.7, height_m: float = 0.2) -> trimesh.Trimes
 def l_shape(
     length_m: float = 1.0, width_m: float = 0.65, limb_m: float = 0.25, height_m: float = 0.3
 ) -> trimesh.Trimesh:
-    """Make an L: the long limb along +x, the short one along +y from its -x end. It has no mirror plane
-    but the horizontal one."""
+    """Make an L: the long limb along +x, the short one along +y from its -x end.
+
+    It has no mirror plane but the horizontal one.
+    """
     long_limb = _block((length_m, limb_m, height_m), (0.0, -(width_m - limb_m) / 2.0))
     short = _block((limb_m, width_m - limb_m, height_m), (-(length_m - limb_m) / 2.0, limb_m / 2.0))
     return join_bodies([long_limb, short])

@@ -275,13 +275,13 @@ def _add_pictures(
     found = None if contact.get("volume") == "main" else view_of_shadow(store, contact)
     mesh, found = _surface(store, contact), found or best_view(store, report)
     if found is not None:
-        name, entry = found
+        _, entry = found
         aspect = math.degrees(entry.info.aspect_rad) % 360.0
         bearing = (90.0 + float(report.get("north_deg") or 0.0) - aspect) % 360.0
         sheet.pictures.append(
             (
                 f"Best shadow, sonar up; the sonar bears {bearing:03.0f}°",
-                lambda axes: _draw_shadow(axes, store, name, entry, contact, mesh),
+                lambda axes: _draw_shadow(axes, store, entry, contact, mesh),
             )
         )
     if "color_by_aspect" in store.pictures:
@@ -314,7 +314,6 @@ def _picture(axes: Any, window: Window, pixels: NDArray[Any], **more: Any) -> No
 def _draw_shadow(
     axes: Any,
     store: ViewStore,
-    name: str,
     entry: Entry,
     contact: Mapping[str, Any],
     mesh: trimesh.Trimesh | None,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import threading
 import zlib
 from collections.abc import Callable
@@ -300,7 +299,7 @@ class PathSource:
                 infos[stamp] = view_info_from_msg(message, name)
             except CsasError as error:
                 self._problem(f"{STREAMS[name].info_topic}: {error}")
-        stat = os.stat(self._bag)
+        stat = Path(self._bag).stat()
         revision = f"{(stat.st_mtime_ns ^ stat.st_size) & 0xFFFFFFFF:08x}"
         for stamp, read in sorted(index.places(name, set(infos)).items()):
 

@@ -147,7 +147,7 @@ def test_the_dark_pixels_are_those_of_the_loop(seed, to_the_edge):
     levels, sigma_r, sigma_s = levels_of(view)
     dark = reference.dark_pixels(view, sigma_r, sigma_s)
     assert dark[55:80, 55:59].all()
-    np.testing.assert_array_equal(segmentation.dark_pixels(levels, view.info), dark)
+    np.testing.assert_array_equal(segmentation.dark_pixels(levels), dark)
 
 
 @pytest.mark.parametrize("to_the_edge", [False, True])

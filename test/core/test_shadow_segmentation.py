@@ -51,6 +51,6 @@ def test_a_shadow_that_leads_away_from_the_target_is_found_to_its_end(bands):
     assert found[ndimage.binary_erosion(shadow, iterations=4)].all()
     assert not found[~ndimage.binary_dilation(shadow, iterations=6)].any()
     # To the pixel it is what hangs together of all that is dark in the view.
-    label, _ = ndimage.label(dark_pixels(view_levels(view), view.info), np.ones((3, 3)))
+    label, _ = ndimage.label(dark_pixels(view_levels(view)), np.ones((3, 3)))
     kept = set(np.unique(label[shadow])) - {0}
     np.testing.assert_array_equal(found, np.isin(label, list(kept)))

@@ -33,7 +33,7 @@ def _interpolate_4x4(count: int) -> Any:
     """
 
     def interpolate(
-        typingctx: Any,
+        typingctx: Any,  # noqa: ARG001  (numba's)
         samples: Any,
         stride: Any,
         table: Any,

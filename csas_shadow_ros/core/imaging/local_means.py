@@ -141,7 +141,7 @@ def _any_over(
 
 
 @kernel()
-def _mark_echoes(
+def _mark_echoes(  # noqa: C901, PLR0912  (a kernel)
     power: FloatImage,
     known: BoolImage,
     spans: Spans,
@@ -200,7 +200,7 @@ def _mark_echoes(
 
 
 @kernel(error_model="numpy")
-def _interiors(
+def _interiors(  # noqa: C901, PLR0912  (a kernel)
     power: FloatImage,
     known: BoolImage,
     spans: Spans,

@@ -37,7 +37,7 @@ _LEAST_CELLS = 5.6
 
 
 def dark_pixels(
-    levels: Levels, info: ViewInfo, rows: slice = slice(None), cols: slice = slice(None)
+    levels: Levels, rows: slice = slice(None), cols: slice = slice(None)
 ) -> NDArray[np.bool_]:
     """Mark pixels whose local mean power belongs to shadow rather than to seabed.
 
@@ -45,8 +45,6 @@ def dark_pixels(
     ----------
     levels : Levels
         The view relative to its seabed level.
-    info : ViewInfo
-        Its resolution sets the box that the mean is taken over.
     rows, cols : slice
         The part of the view to look at, without steps: all of it.
     """
@@ -179,7 +177,7 @@ def _of_target(
     while True:
         begin, end = max(0, rows[0] - margin), min(camera.rows, rows[1] + _LONGER * margin)
         first, last = max(0, cols[0] - margin), min(camera.cols, cols[1] + margin)
-        dark = dark_pixels(levels, info, slice(begin, end), slice(first, last))
+        dark = dark_pixels(levels, slice(begin, end), slice(first, last))
         out = np.zeros(dark.shape, np.bool_)
         open_sides = begin > 0, end < camera.rows, first > 0, last < camera.cols
         found = _patches_in_box(

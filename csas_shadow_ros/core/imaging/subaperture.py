@@ -188,7 +188,7 @@ def _half_size(
 
 
 @kernel(error_model="numpy")
-def _cut_wedge(
+def _cut_wedge(  # noqa: C901, PLR0912  (a kernel)
     spectrum: NDArray[np.complex64],
     centre: tuple[int, int],
     half: tuple[int, int],

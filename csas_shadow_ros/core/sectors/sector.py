@@ -18,11 +18,14 @@ class HasBand(Protocol):
     """A sector, or what is known of one before its pixels are read."""
 
     @property
-    def grid(self) -> GroundGrid: ...
+    def grid(self) -> GroundGrid:
+        """Lattice."""
     @property
-    def acoustics(self) -> Acoustics: ...
+    def acoustics(self) -> Acoustics:
+        """Band."""
     @property
-    def frame(self) -> str: ...
+    def frame(self) -> str:
+        """Frame id."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -185,7 +185,7 @@ def _alike(
 
 
 @kernel(fastmath={"contract", "arcp", "nsz"})
-def _carve_masks(
+def _carve_masks(  # noqa: C901, PLR0912  (a kernel)
     cells: NDArray[np.uint8],
     sums: NDArray[np.uint32],
     affines: NDArray[np.float64],

@@ -224,10 +224,9 @@ def _side(
     target_px: tuple[float, float],
     cell_px: tuple[float, float],
 ) -> tuple[dict[str, float], str] | None:
-    """Return how far out a side reaches (pixels from column u0, at the target's range) if it is of each of
-    `SHAPES`, and which it seems to be.
+    """Return how far out a side reaches if it is of each of `SHAPES`, and which it seems to be.
 
-    None where too little of it is seen.
+    In pixels from column u0, at the target's range; None where too little of it is seen.
     """
     # By a running median: choosing rows by their own edges would favour those that err outwards.
     down_px, across_px = cell_px

@@ -47,6 +47,32 @@ def judge(result: Result) -> None:
         Everything else of it is there.
     """
     reasons: list[str] = []
+    worst = _decide(result, reasons)
+    cut, told = sum(side.cut for side in result.sides), len(result.sides)
+    if told and cut > _MOST_CUT * told:
+        reasons.append(f"the shadow leaves the image in {cut} of {told} views; expected a larger image")
+        worst = max(worst, 1)
+        if result.verdict == "no object":
+            result.verdict, worst = "undecided", 2
+    if result.mesh is not None and result.grid is not None:
+        sides = cut_sides(result.grid)
+        if len(sides) == _ALL_SIDES:
+            reasons.append("the carved volume lies inside of the object: it ends at no side of it")
+        else:
+            reasons += [f"the carved volume cuts the object at its {side}" for side in sides]
+        worst = 2 if sides else worst
+    if result.views_used:
+        worst = max(worst, _views_of(result, reasons))
+    if beside := [*_pieces(result), *_in_shadow(result)]:
+        reasons += beside
+        worst = max(worst, 1)
+    # Semicolons separate reasons where they travel as one text: none may hold one.
+    told_reasons = tuple(reason.replace(";", ",") for reason in reasons)
+    result.quality = Quality(("good", "limited", "not trustworthy")[worst], told_reasons)
+
+
+def _decide(result: Result, reasons: list[str]) -> int:
+    """Set the verdict; say how bad what speaks against it is: 0 or 2."""
     worst = 0
     refused = len(result.rejected)
     first = next(iter(result.rejected.values()), "")
@@ -65,43 +91,32 @@ def judge(result: Result) -> None:
         reasons += _candidates(result)
         if reasons:
             result.verdict, worst = "undecided", 2
-    cut, told = sum(side.cut for side in result.sides), len(result.sides)
-    if told and cut > _MOST_CUT * told:
-        reasons.append(f"the shadow leaves the image in {cut} of {told} views; expected a larger image")
+    return worst
+
+
+def _views_of(result: Result, reasons: list[str]) -> int:
+    """Say what the views lack, and how bad that is: 0, 1 or 2."""
+    worst = 0
+    refused = len(result.rejected)
+    arc = math.degrees(result.arc_rad)
+    if arc < 360.0 * _WHOLE_ARC:
+        reasons.append(f"the views cover {arc:.0f}° of the circle")
         worst = max(worst, 1)
-        if result.verdict == "no object":
-            result.verdict, worst = "undecided", 2
-    if result.mesh is not None and result.grid is not None:
-        sides = cut_sides(result.grid)
-        if len(sides) == _ALL_SIDES:
-            reasons.append("the carved volume lies inside of the object: it ends at no side of it")
-        else:
-            reasons += [f"the carved volume cuts the object at its {side}" for side in sides]
-        worst = 2 if sides else worst
-    if result.views_used:
-        arc = math.degrees(result.arc_rad)
-        if arc < 360.0 * _WHOLE_ARC:
-            reasons.append(f"the views cover {arc:.0f}° of the circle")
-            worst = max(worst, 1)
-        if refused > _MOST_REJECTED * (refused + result.views_used):
-            reasons.append(f"{refused} of {refused + result.views_used} views were not used: {first}")
-            worst = max(worst, 1)
-        worst = max(worst, _fit_of(result, reasons))
-        if result.by_likelihood_alone:
-            reasons.append(
-                "its shadow is too thin or too faint to segment in single views: carved from the mean"
-                " likelihood of all views, sizes are rough"
-            )
-            worst = max(worst, 1)
-        if result.final and result.dimensions is not None and not result.dimensions.intervals:
-            reasons.append("too few sides of shadows were seen for intervals")
-            worst = max(worst, 1)
-    if beside := [*_pieces(result), *_in_shadow(result)]:
-        reasons += beside
+    if refused > _MOST_REJECTED * (refused + result.views_used):
+        first = next(iter(result.rejected.values()))
+        reasons.append(f"{refused} of {refused + result.views_used} views were not used: {first}")
         worst = max(worst, 1)
-    # Semicolons separate reasons where they travel as one text: none may hold one.
-    told_reasons = tuple(reason.replace(";", ",") for reason in reasons)
-    result.quality = Quality(("good", "limited", "not trustworthy")[worst], told_reasons)
+    worst = max(worst, _fit_of(result, reasons))
+    if result.by_likelihood_alone:
+        reasons.append(
+            "its shadow is too thin or too faint to segment in single views: carved from the mean"
+            " likelihood of all views, sizes are rough"
+        )
+        worst = max(worst, 1)
+    if result.final and result.dimensions is not None and not result.dimensions.intervals:
+        reasons.append("too few sides of shadows were seen for intervals")
+        worst = max(worst, 1)
+    return worst
 
 
 def _pieces(result: Result) -> list[str]:

@@ -16,6 +16,7 @@ import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import rclpy
@@ -1233,7 +1234,7 @@ def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> in
     """
     if "HOME" not in os.environ:
         # rclpy.init raises where it can find no directory for its log.
-        os.environ.setdefault("ROS_LOG_DIR", os.path.join(tempfile.gettempdir(), "ros_log"))
+        os.environ.setdefault("ROS_LOG_DIR", str(Path(tempfile.gettempdir(), "ros_log")))
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         # Not rclpy's handlers: they shut the context down before the node can say goodbye.

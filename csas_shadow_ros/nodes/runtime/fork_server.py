@@ -75,7 +75,7 @@ def fork(main: Any, node: str, arguments: list[str], log: str, answers: int) -> 
             os._exit(0)
     os.close(writer)
     os.waitpid(between, 0)
-    with open(reader, "rb") as pipe:
+    with os.fdopen(reader, "rb") as pipe:
         told = pipe.read()
     if not told:
         raise RuntimeError("no further process could be made")
