@@ -657,7 +657,7 @@ class BagWriter:
         }
 
 
-class _PlainDumper(yaml.SafeDumper):
+class _PlainDumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
     """Writes equal parts out: not every reader of metadata knows YAML's anchors."""
 
     def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002  (PyYAML's)

@@ -25,7 +25,7 @@ _MOST_DEPTH = 32
 _Parser: Any = yaml.cyaml.CParser if yaml.__with_libyaml__ else yaml.SafeLoader
 
 
-class _Loader(Composer, _Parser, SafeConstructor, Resolver):
+class _Loader(Composer, _Parser, SafeConstructor, Resolver):  # type: ignore[misc]  # PyYAML has no types
     """Loads plain YAML whose depth, and whose size with all aliases written out, are bounded."""
 
     def __init__(self, text: str) -> None:

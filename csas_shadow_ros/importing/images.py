@@ -325,7 +325,7 @@ def _sicd(path: Path, datum: Datum | None) -> FoundImage:
         k if sign > 0 else n - 1 - k for k, n, sign in zip(middle - first, pixels.shape, signs, strict=True)
     ]
     col, row = (at[1], at[0]) if lies[0] in ("south", "north") else (at[0], at[1])
-    array = np.ascontiguousarray(turn(pixels)).astype(np.complex64, copy=False)
+    array = np.ascontiguousarray(turn(pixels)).astype(np.complex64, copy=False)  # type: ignore[no-untyped-call]
     rows, cols = array.shape
     step = steps[0]
     grid = GroundGrid(rows, cols, step, x - col * step, y + row * step)

@@ -34,10 +34,11 @@ from ..core.geometry import (
 from ..core.imaging.enhancement import enhance
 from ..core.imaging.masks import MASK_COVERED, MASK_SHADOW, MASK_UNKNOWN
 from ..core.imaging.subaperture import Spectrum, SubApertures
+from ..core.pipeline import ProcessedView
 from ..core.shape.mesh import surface_field
 from ..core.shape.picture import view_extent
 from ..core.shape.volume import VoxelGrid
-from .subject import SIX_ASPECTS_DEG, ProcessedView, Subject
+from .subject import SIX_ASPECTS_DEG, Subject
 
 #: Levels shown, dB over the median.
 _DB_LOW, _DB_HIGH = -20.0, 20.0

@@ -19,7 +19,7 @@ from msg_adapters.topics import RESULT_TOPICS, split_prefix, stream
 
 from ..bags import BagReader
 from ..bags.index import BagIndex
-from ..bags.run import checked_messages
+from ..bags.pairs import checked_messages
 from ..core.errors import CsasError
 from ..core.geometry import GroundGrid, View, wrap_angle
 from ..core.parameters import PipelineParameters

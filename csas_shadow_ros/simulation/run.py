@@ -296,7 +296,7 @@ class _Orbit:
             raise ParameterError(
                 f"tilt_deg is {self._faults.tilt_deg:g}; expected one that keeps the sonar above the seabed"
             )
-        return true
+        return np.asarray(true)
 
 
 def _in_arcs(aspect_deg: Any, arcs: tuple[tuple[float, float], ...]) -> Any:

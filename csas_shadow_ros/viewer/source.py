@@ -25,7 +25,7 @@ from msg_adapters.track import track_from_msg
 
 from ..bags import BagReader, iterate_pairs, read_run
 from ..bags.index import BagIndex
-from ..bags.run import checked_messages
+from ..bags.pairs import checked_messages
 from ..core.errors import BagError, CsasError
 from ..core.geometry import CoherentImage, Track, View
 from ..core.imaging.subaperture import SubApertures

@@ -85,7 +85,7 @@ def mesh_from_grid(grid: VoxelGrid) -> trimesh.Trimesh:
     d = grid.volume.voxel_size_m
     field = surface_field(grid)
     origin = np.asarray(grid.volume.origin_m)
-    vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
+    vertices, faces, _, _ = marching_cubes(
         field, 0.0, spacing=(d, d, d)
     )
     xyz = vertices[:, ::-1] - d + origin  # (z, y, x) → (x, y, z); -d: the padding

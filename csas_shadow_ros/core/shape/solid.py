@@ -162,7 +162,7 @@ def _alike(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     import trimesh
 
     turned = mesh.copy()
-    trimesh.repair.fix_winding(turned)  # type: ignore[no-untyped-call]
+    trimesh.repair.fix_winding(turned)
     return turned
 
 
@@ -171,7 +171,7 @@ def bodies_of(mesh: trimesh.Trimesh) -> NDArray[np.int64]:
     import trimesh
 
     count = len(mesh.faces)
-    labels = trimesh.graph.connected_component_labels(  # type: ignore[no-untyped-call]
+    labels = trimesh.graph.connected_component_labels(
         mesh.face_adjacency, node_count=count
     )
     return np.asarray(labels, dtype=np.int64)

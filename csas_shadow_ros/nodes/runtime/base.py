@@ -575,7 +575,7 @@ class CsasNode(LifecycleNode):
     def start(self) -> bool:
         """Configure and activate; False if the node refuses, which is logged."""
         ok = TransitionCallbackReturn.SUCCESS
-        return self.trigger_configure() == ok and self.trigger_activate() == ok
+        return bool(self.trigger_configure() == ok and self.trigger_activate() == ok)
 
     def stop(self) -> None:
         """End the work in an orderly way."""
