@@ -314,3 +314,115 @@ def test_a_depth_for_a_height_contradicts_the_band_by_name(depth):
     assert fits == pytest.approx(18.0, abs=4.0)
     assert f"the track has z = {depth:.1f} m" in problem
     assert level == ("error" if depth == 60.0 else "warning")
+
+
+# --- navigation as vehicles log it, each in the way that a recording has it
+
+WHOLE = circle()
+FLOWN = WHOLE.positions_m
+
+
+def flown(positions, first=0):
+    """Return a track of these positions, of which number `first` was at the run's first moment."""
+    return Track(START_NS + SECOND_NS * (np.arange(len(positions)) - first), positions)
+
+
+def straight(n, a, b):
+    return np.linspace(a, b, n, endpoint=False)
+
+
+_LINE = np.c_[np.full(200, 250.0), np.linspace(-300, 300, 200), np.full(200, 18.0)]
+_TO, _FROM = straight(150, FLOWN[0] + (270, -40, 3), FLOWN[0]), straight(151, FLOWN[-1], (-250, 30, 18))[1:]
+_LINED = np.vstack([_LINE, straight(100, _LINE[-1], FLOWN[0])])
+_UP = np.add(FLOWN, (0, 0, 6))
+_SPIRAL = np.vstack([FLOWN, FLOWN])
+_SPIRAL[:, 2] = np.linspace(24, 18, 720)
+
+
+def doubled_stamp():
+    message = part(WHOLE, 0, 360)
+    message.poses[150].header.stamp = message.poses[149].header.stamp
+    return message
+
+
+def jumped():
+    positions = FLOWN.copy()
+    positions[150] += (8, 8, 0)
+    return flown(positions)
+
+
+def by_another_clock():
+    return Track(WHOLE.stamps_ns - START_NS + SECOND_NS, FLOWN)
+
+
+#: What is logged; the poses that are left of it; what `check` and `run` say of it, or why they refuse it.
+TAKEN = {
+    "approach": (flown(np.vstack([_TO, FLOWN]), 150), FLOWN, "150 of 510 track poses are not on the circle"),
+    "departure": (flown(np.vstack([FLOWN, _FROM])), FLOWN, "150 of 510 track poses are not on the circle"),
+    "both": (flown(np.vstack([_TO, FLOWN, _FROM]), 150), FLOWN, "300 of 660 track poses are not on"),
+    "survey line": (flown(np.vstack([_LINED, FLOWN]), 300), FLOWN, "300 of 660 track poses are not on"),
+    "survey line after": (
+        flown(np.vstack([FLOWN, straight(100, FLOWN[-1], _LINE[0])[1:], _LINE])),
+        FLOWN,
+        "299 of 659 track poses are not on the circle",
+    ),
+    "a lap 6 m higher before": (flown(np.vstack([_UP, FLOWN]), 360), FLOWN, "0.0° to 360.0° 2 times, up to"),
+    "a lap 6 m higher after": (flown(np.vstack([FLOWN, _UP])), FLOWN, "0.0° to 360.0° 2 times, up to 6.0 m"),
+    "a spiral": (flown(_SPIRAL, 360), _SPIRAL[360:], "the track sinks from 21.0 to 18.0 m height"),
+    "standing at the start": (
+        flown(np.vstack([np.repeat(FLOWN[:1], 300, 0), FLOWN]), 300),
+        FLOWN,
+        "the sonar stands still for up to 306.0 s: 300 of 660 track poses",
+    ),
+    "two poses of one stamp": (doubled_stamp(), np.delete(FLOWN, 150, 0), "out of order: pose 150 "),
+    "a pose without a fix": (spoil([150], x=math.nan), np.delete(FLOWN, 150, 0), "track pose 150 is [nan"),
+    "a pose 8 m off": (jumped(), np.delete(FLOWN, 150, 0), "track pose 150 "),
+}
+REFUSED = {
+    "z down": (spoil(range(360), z=-18.0), "is z positive downwards"),
+    "depth for height": (flown(FLOWN * (1, 1, 0) + (0, 0, 60)), "above the seabed, not a depth?"),
+    "UTM": (flown(np.add(FLOWN, (391234.5, 5345678.9, 0))), "map coordinates (UTM)"),
+    "degrees": (flown(np.c_[FLOWN[:, 0] / 74e3, 48.38 + FLOWN[:, 1] / 111e3, FLOWN[:, 2]]), "degrees of lat"),
+    "another frame": (Track(WHOLE.stamps_ns, FLOWN, frame="map"), "is in frame 'map', the image in"),
+    "by another clock": (by_another_clock(), "no track covers its stamp"),
+}
+
+
+@pytest.mark.parametrize("name", TAKEN)
+def test_navigation_that_holds_more_than_the_circle_leaves_the_circle_and_is_told_by_both(tmp_path, name):
+    logged, left, told = TAKEN[name]
+    path = bag(tmp_path / "run", tracks=[logged], images=[image_at(END_NS)])
+    run = read_run(path)
+    np.testing.assert_array_equal(run.track.positions_m, left)
+    report = check_bag(path)
+    assert report.ok, str(report)
+    warned = [f.problem for f in report.findings if f.level == "warning"]
+    assert any(told in text for text in warned), warned
+    # Nothing that `check` warns of is unknown to `run`.
+    assert {p.reason for p in run.problems} >= set(warned)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_navigation_of_other_axes_units_frames_or_clocks_is_refused_by_both(tmp_path, capsys, name):
+    logged, told = REFUSED[name]
+    path = bag(tmp_path / "run", tracks=[logged], images=[image_at(END_NS)])
+    report = check_bag(path)
+    assert not report.ok
+    assert any(told in f.problem for f in report.findings if f.level == "error"), str(report)
+    assert cli.main(["run", str(path), "--out", str(tmp_path / "out"), "-q"]) == 1
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_odometry_on_the_topic_of_the_track_is_refused_by_both_with_both_types(tmp_path, capsys):
+    path = tmp_path / "run"
+    with BagWriter(path) as writer:
+        for name, message in zip(
+            ("image", "camera_info"), coherent_image_to_msgs(FACTORY, image_at(END_NS)), strict=True
+        ):
+            writer.write(f"/csas/{name}", message)
+        writer.write("/csas/track", b"\0\1\0\0" + bytes(720), END_NS, type_name="nav_msgs/msg/Odometry")
+    told = "its type is 'nav_msgs/msg/Odometry'; expected nav_msgs/msg/Path"
+    assert told in [f.problem for f in check_bag(path).findings]
+    assert cli.main(["run", str(path), "--out", str(tmp_path / "out"), "-q"]) == 1
+    assert told in capsys.readouterr().err

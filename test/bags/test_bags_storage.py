@@ -109,12 +109,12 @@ def test_a_bag_reads_the_same_whatever_its_metadata_says(tmp_path, plugin, mode,
             "rosbag2_bagfile_information": {"relative_file_paths": information["relative_file_paths"]}
         }
     (path / "metadata.yaml").write_text(yaml.safe_dump(document))
-    if change == "lost":
+    if change == "no metadata.yaml":
         (path / "metadata.yaml").unlink()
     reader = BagReader(path)
     assert content(path) == list(messages())
     assert reader.message_count == VIEWS
-    assert reader.complete == (change != "lost")
+    assert reader.complete == (change != "no metadata.yaml")
     for file in path.glob("bag*"):
         assert content(file) == list(messages()), f"{file.name} alone"
 

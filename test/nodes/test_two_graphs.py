@@ -18,7 +18,8 @@ pytest.importorskip("rclpy")
 from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M, Graph
 
 import csas_shadow_ros
-from csas_shadow_ros.bags import write_run
+from csas_shadow_ros.bags import BagReader, BagWriter, write_run
+from csas_shadow_ros.core.errors import BagError
 from csas_shadow_ros.core.pipeline import ProcessedView, Result, run
 from csas_shadow_ros.graph.processes import DomainReservation, ReplayError
 from csas_shadow_ros.graph.replay import replay
@@ -91,6 +92,25 @@ def test_two_replays_at_once_with_one_draw_leave_each_its_own_bags_grid(
         assert result.grid is not None
         found = np.load(tmp_path / f"out_{i}" / "grid.npz")
         np.testing.assert_array_equal(found["likelihood"], result.grid.likelihood)
+
+
+def test_a_replay_of_a_bag_of_two_runs_plays_the_one_whose_namespace_it_is_told(
+    run_bag: Path, reference: Reference, tmp_path: Path
+) -> None:
+    two = tmp_path / "two"
+    cone = simulate("tiny", "cone", seed=7)
+    other = write_run(tmp_path / "cone", cone.image, cone.track)
+    with BagWriter(two) as writer:
+        for bag, namespace in ((other, "/port"), (run_bag, "/starboard")):
+            for m in BagReader(bag).messages():
+                topic = m.topic.replace("/csas", namespace)
+                writer.write(topic, m.cdr, m.log_time_ns, type_name=m.type_name)
+    with pytest.raises(BagError, match="holds topics of /port and of /starboard; expected one run: name"):
+        replay(two, parameters=PARAMETERS, progress=False)
+    result = replay(two, parameters=PARAMETERS, namespace="/starboard", composites=False, progress=False)
+    assert result.grid is not None
+    assert reference[0].grid is not None
+    np.testing.assert_array_equal(result.grid.likelihood, reference[0].grid.likelihood)
 
 
 def test_two_replays_into_one_domain_are_one_too_many(domain: int, run_bag: Path) -> None:
