@@ -599,8 +599,12 @@ def judge_band(grid: GroundGrid, acoustics: Acoustics, track: Track) -> Iterator
 
 def judge_stuck(image: CoherentImage) -> Iterator[tuple[str, str, str]]:
     """Yield (level, problem, remedy) if single pixels outshine the image: sidelobes fill the shadows."""
-    power = image.pixels.real.astype(np.float32) ** 2
-    power += image.pixels.imag.astype(np.float32) ** 2
+    peak = max(float(np.abs(image.pixels.real).max()), float(np.abs(image.pixels.imag).max()))
+    if not peak > 0.0:
+        return
+    # Relative to the peak: squares of what a driver may send (1e20, 1e-22) are beyond float32.
+    power = (image.pixels.real / peak).astype(np.float32) ** 2
+    power += (image.pixels.imag / peak).astype(np.float32) ** 2
     sample = power.reshape(-1)[:: max(1, power.size // _MEDIAN_OF)]
     lit = sample[sample > 0]
     if not lit.size:

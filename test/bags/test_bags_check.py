@@ -448,6 +448,16 @@ def test_a_stuck_pixel_is_named_with_its_level_and_refused_where_it_costs_the_sh
     assert "Set it to 0" in remedy
 
 
+@pytest.mark.parametrize("amplitude", [1e-30, 1e-20, 1e18, 1e25, 1e34])
+def test_a_stuck_pixel_is_found_and_no_other_whatever_the_amplitude(amplitude):
+    """Squares of these are beyond what float32 holds."""
+    image = with_pixels(60.0, (5, 7))
+    scale = np.float32(amplitude)
+    assert levels(judge_stuck(replace(annulus_image(), pixels=annulus_image().pixels * scale))) == []
+    ((_, problem, _),) = judge_stuck(replace(image, pixels=image.pixels * scale))
+    assert "row 5, column 7 is 60 dB over the median" in problem
+
+
 def test_several_stuck_pixels_are_counted():
     ((_, problem, _),) = judge_stuck(with_pixels(70.0, (3, 4), (60, 60), (100, 2)))
     assert "(and 2 more like it)" in problem
