@@ -62,6 +62,9 @@ TEST += ARCHIVE
 TEST += CLUSTER
 # Charts: GeoTIFF and vectors by GDAL, labelled arrays as NetCDF and Zarr.
 MAPS = ["rasterio>=1.3.10", "pyogrio>=0.7.2", "h5netcdf>=1.3", "h5py>=3.10", "zarr>=2.18", "xarray>=2024.10"]
+# Keys and permissions for SROS 2.
+SECURITY = ["cryptography>=41"]
+TEST += SECURITY
 # Images and navigation of others.
 IMPORT = ["rasterio>=1.3.10", "h5py>=3.10", 'sarkit>=1.0; python_version >= "3.11"']
 TEST += MAPS
@@ -162,6 +165,7 @@ setup(
         "cluster": ARCHIVE + CLUSTER,
         "maps": MAPS,
         "import": IMPORT,
+        "security": SECURITY,
         "test": TEST,
         "bench": BENCH,
         "build": BUILD,

@@ -11,8 +11,12 @@ launch with one line that says which, and so does an argument that would go nowh
 
 Several vehicles in one domain have a namespace and a frame each:
 `namespace:=auv_1 scene_frame:=auv_1/scene`.
+
+The nodes find, and are found by, this machine's nodes alone. `discovery_range:=SUBNET`, or
+ROS_AUTOMATIC_DISCOVERY_RANGE in the environment, lets others take part.
 """
 
+import os
 import sys
 import uuid
 from pathlib import Path
@@ -47,6 +51,12 @@ ARGUMENTS = {
     "rate": ("0.0", (REPLAY, PLAY), "views: times the recorded speed; 0.0: as fast as they are taken"),
     "params": (PathJoinSubstitution([SHARE, "config", "csas_shadow.yaml"]), ALL, "parameters of all nodes"),
     "domain_id": ("none", ALL, "ROS domain; none: that of ROS_DOMAIN_ID, of a replay one that nobody uses"),
+    "discovery_range": (
+        "auto",
+        NODES,
+        "whose nodes are found: LOCALHOST, SUBNET, OFF or SYSTEM_DEFAULT; auto: what"
+        " ROS_AUTOMATIC_DISCOVERY_RANGE says, else LOCALHOST",
+    ),
     "origin_lat_deg": ("none", ALL, "latitude of the scene's origin, WGS-84; none: topic origin says it"),
     "origin_lon_deg": ("none", ALL, "its longitude"),
     "origin_heading_deg": ("none", ALL, "true bearing of the scene's y axis, clockwise; none: north"),
@@ -60,6 +70,8 @@ ARGUMENTS = {
     "respawn": ("true", NODES, "restart a node that dies"),
     "shared_memory": ("true", NODES, "Fast DDS profile for large messages"),
 }
+#: What ROS_AUTOMATIC_DISCOVERY_RANGE may be; rcl warns of any other value and takes the whole subnet.
+RANGE, RANGES = "ROS_AUTOMATIC_DISCOVERY_RANGE", ("LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT")
 FLAGS = [name for name, (default, *_) in ARGUMENTS.items() if default in ("true", "false")]
 
 
@@ -90,6 +102,15 @@ def truth(name, text):
     if text.lower() not in ("true", "false"):
         raise RuntimeError(f"{name} is {text!r}; expected true or false")
     return text.lower() == "true"
+
+
+def discovery_range(text):
+    """Return whose nodes are found: what is asked for, what the user's shell says, or this machine's."""
+    asked = os.environ.get(RANGE) or "LOCALHOST" if text == "auto" else text
+    if asked.upper() not in RANGES:
+        name = RANGE if text == "auto" else "discovery_range"
+        raise RuntimeError(f"{name} is {asked!r}; expected one of: {', '.join(RANGES)}")
+    return asked.upper()
 
 
 def start(context):
@@ -139,6 +160,8 @@ def nodes(value, *, play):
             executable=name,
             name=name,
             namespace=value["namespace"],
+            # Whose keys it has, where ROS_SECURITY_ENABLE asks for them (docs/security.md).
+            ros_arguments=["--enclave", f"/{value['namespace']}/{name}".replace("//", "/")],
             parameters=[value["params"], common | parameters],
             output="screen",
             # Flow control brings a restarted node everything that it lacks.
@@ -154,6 +177,8 @@ def nodes(value, *, play):
         place["parent_frame"] = value["parent_frame"]
     # Who hears another graph in its namespace refuses it by this; a restarted node has the same.
     environment = {"CSAS_GRAPH_ID": uuid.uuid4().hex[:12]}
+    # Whoever may publish in a graph may stop it, or feed it: by default that is nobody elsewhere.
+    environment[RANGE] = discovery_range(value["discovery_range"])
     if value["domain_id"]:
         environment["ROS_DOMAIN_ID"] = value["domain_id"]
     if flags["shared_memory"]:

@@ -15,6 +15,7 @@ from .check import add_check
 from .console import FAILED, PROGRAM, Command, Console, Help
 from .exchange import add_export, add_import
 from .info import add_info
+from .keys import add_keys
 from .replay import add_replay
 from .run import add_run
 from .simulate import add_simulate
@@ -78,6 +79,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_export(add)
     add_view(add)
     add_report(add)
+    add_keys(add)
     add_warm(add)
     return parser
 

@@ -195,6 +195,7 @@ class _Watcher:
 
         from ..nodes import qos
         from ..nodes.runtime.hearing import make_hearing
+        from ..nodes.runtime.secured import security_told
 
         self._qos = qos
         self._rclpy = rclpy
@@ -205,10 +206,11 @@ class _Watcher:
             context = Context()
             try:
                 rclpy.init(context=context, domain_id=domain_id)
-                # Nobody would answer who asks for its parameters.
-                return rclpy.create_node(
-                    "replay", context=context, namespace="csas", start_parameter_services=False
-                )
+                with security_told():
+                    # Nobody would answer who asks for its parameters.
+                    return rclpy.create_node(
+                        "replay", context=context, namespace="csas", start_parameter_services=False
+                    )
             except BaseException:
                 rclpy.try_shutdown(context=context)
                 raise

@@ -688,7 +688,9 @@ def test_warm_tells_what_it_compiled_and_where_that_is_kept():
     assert told["folder"] in again.out
 
 
-@pytest.mark.parametrize("arguments", [(), ("run",), ("replay",), ("check",), ("view",), ("warm",)])
+@pytest.mark.parametrize(
+    "arguments", [(), ("run",), ("replay",), ("check",), ("view",), ("warm",), ("keys",)]
+)
 def test_help_comes_before_any_numerical_library(arguments):
     code = (
         "import sys; from csas_shadow_ros.cli import main\n"

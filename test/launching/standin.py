@@ -127,9 +127,11 @@ class Node(ExecuteProcess):
         name: str,
         namespace: str,
         parameters: list[Any],
+        ros_arguments: list[Any],
         **options: Any,
     ) -> None:
         super().__init__(cmd=[], **options)
+        self.ros_arguments = ros_arguments
         self.package, self.executable, self.name = package, executable, name
         self.namespace, self.parameters = namespace, parameters
 
@@ -139,7 +141,8 @@ class Node(ExecuteProcess):
         place = Path(get_package_prefix(self.package)) / "lib" / self.package / self.executable
         assert os.access(place, os.X_OK), f"{place} cannot be executed"
         space = f"/{self.namespace.strip('/')}"
-        command = [str(place), "--ros-args", "-r", f"__node:={self.name}", "-r", f"__ns:={space}"]
+        command = [str(place), "--ros-args", *(perform(word, context) for word in self.ros_arguments)]
+        command += ["-r", f"__node:={self.name}", "-r", f"__ns:={space}"]
         for one in self.parameters:
             command += ["--params-file", self._file(one) if isinstance(one, dict) else perform(one, context)]
         return command

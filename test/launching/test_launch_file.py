@@ -35,6 +35,7 @@ OTHER = {
     "rate": "2.0",
     "params": str(ROOT / "constraints"),
     "domain_id": "77",
+    "discovery_range": "SUBNET",
     "origin_lat_deg": "48.0",
     "origin_lon_deg": "-4.5",
     "origin_heading_deg": "30.0",
@@ -107,6 +108,48 @@ def test_a_replay_gets_a_command_line_that_it_understands(launched: Follow) -> N
     assert parsed.rate == 2.0
 
 
+@pytest.mark.parametrize(
+    ("shell", "argument", "expected"),
+    [
+        (None, "auto", "LOCALHOST"),
+        ("", "auto", "LOCALHOST"),
+        ("SUBNET", "auto", "SUBNET"),
+        ("off", "auto", "OFF"),
+        (None, "SUBNET", "SUBNET"),
+        ("SUBNET", "LOCALHOST", "LOCALHOST"),
+    ],
+)
+def test_live_nodes_stay_on_this_machine_unless_somebody_says_otherwise(
+    launched: Follow, monkeypatch: pytest.MonkeyPatch, shell: str | None, argument: str, expected: str
+) -> None:
+    monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
+    if shell is not None:
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", shell)
+    for mode in ("live", "play"):
+        started = launched(**MODES[mode], discovery_range=argument)
+        seen = {**os.environ, **started.environment}
+        assert seen["ROS_AUTOMATIC_DISCOVERY_RANGE"] == expected
+
+
+def test_a_range_that_the_shell_says_and_that_there_is_not_is_refused(
+    launched: Follow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # rcl only warns of it, and takes the whole subnet.
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCAL")
+    with pytest.raises(RuntimeError, match="ROS_AUTOMATIC_DISCOVERY_RANGE is 'LOCAL'; expected one of"):
+        launched()
+
+
+def test_each_node_is_told_the_enclave_of_its_keys(launched: Follow) -> None:
+    from csas_shadow_ros.security import enclave_path
+
+    for namespace, space in (("csas", "/csas"), ("/auv_1/csas/", "auv_1/csas"), ("none", "")):
+        started = launched(bag="a_bag", results="none", namespace=namespace, out="made", viewer="true")
+        assert set(started.commands) == set(NODES)
+        for node, command in started.commands.items():
+            assert command[command.index("--enclave") + 1] == enclave_path(node, space)
+
+
 @pytest.mark.parametrize("nothing", ["none", "", "''", '""'])
 def test_no_results_means_nodes_that_stay(launched: Follow, nothing: str) -> None:
     assert "bag_player" in launched(bag="a_bag", results=nothing).commands
@@ -118,6 +161,10 @@ def test_no_results_means_nodes_that_stay(launched: Follow, nothing: str) -> Non
     [
         ({"namespce": "auv_1"}, "there is no argument 'namespce'; expected one of: bag, results"),
         ({"viewer": "yes"}, "viewer is 'yes'; expected true or false"),
+        (
+            {"discovery_range": "world"},
+            "discovery_range is 'world'; expected one of: LOCALHOST, SUBNET, OFF, SYSTEM_DEFAULT",
+        ),
         ({"origin_lat_deg": "north"}, "origin_lat_deg is 'north'; expected a number"),
         ({"results": "somewhere"}, "results is 'somewhere', which nodes without a bag cannot take"),
     ],

@@ -72,6 +72,7 @@ from .hearing import make_hearing
 from .host import Host
 from .params import DYNAMIC, NODES, declare, from_overrides
 from .rivals import Rivals
+from .secured import security_told
 from .shared_memory import tidy_up_after_a_killed_graph
 
 NAMESPACE = "csas"
@@ -1249,7 +1250,8 @@ def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> in
             # rclpy's own errors: arguments or a parameter file that cannot be read.
             raise ParameterError(str(error)) from None
         try:
-            return kind(context=context)
+            with security_told():
+                return kind(context=context)
         except BaseException:
             rclpy.try_shutdown(context=context)
             raise
