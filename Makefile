@@ -5,6 +5,7 @@ SHELL := /bin/bash
 
 VENV ?= .venv
 COLCON_VENV ?= .venv-colcon
+LOCK_VENV ?= .venv-lock
 # Any Python 3.10 to 3.13; the first of these that runs and is one.
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3.10 python3; do \
 	$$p -c 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' \
@@ -33,7 +34,7 @@ SOURCES := $(shell find csas_shadow_ros msg_adapters config launch -type f \
 	-not -name '*.pyc' -not -path '*/__pycache__*' 2>/dev/null)
 PACKAGING := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help venv install demo docs test lint types unit long soak accuracy accuracy-short population bench build clean
+.PHONY: help venv install demo docs test lint types unit long soak accuracy accuracy-short population bench build lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -115,6 +116,22 @@ bench: install ## the speed benchmark: a table of bounds, docs/performance.json 
 	$(PY) -m pip install --quiet --disable-pip-version-check '.[bench]'
 	OPENBLAS_NUM_THREADS=1 $(PY) benchmarks/speed.py $(BENCH_ARGUMENTS)
 
+# What the locked files hold beside the package's own needs: what builds it without an index.
+LOCK_BUILD := setuptools>=68,<80\nwheel\n
+LOCK_EXTRAS := ros xarray archive cluster maps import security
+LOCK := $(LOCK_VENV)/bin/uv pip compile setup.py - --quiet --universal --python-version 3.10 --upgrade \
+	--generate-hashes --no-annotate --custom-compile-command "make lock"
+
+lock: $(LOCK_VENV)/.installed ## write constraints/locked*.txt anew: newest versions, with hashes
+	printf '$(LOCK_BUILD)' | $(LOCK) --output-file constraints/locked.txt
+	printf '$(LOCK_BUILD)' | $(LOCK) $(LOCK_EXTRAS:%=--extra %) --output-file constraints/locked-all.txt
+
+$(LOCK_VENV)/.installed:
+	@test -n "$(PYTHON)" || { echo "no Python 3.10 to 3.13 with venv found: name one, make PYTHON=..." >&2; exit 1; }
+	$(PYTHON) -m venv $(LOCK_VENV)
+	$(LOCK_VENV)/bin/pip install --quiet --disable-pip-version-check 'uv>=0.9,<1'
+	touch $@
+
 $(COLCON_VENV)/.installed: setup.py
 	@test -n "$(PYTHON)" || { echo "no Python 3.10 to 3.13 with venv found: name one, make PYTHON=..." >&2; exit 1; }
 	$(PYTHON) -m venv $(COLCON_VENV)
@@ -126,5 +143,5 @@ build: $(COLCON_VENV)/.installed ## colcon build, with colcon from PyPI
 		--base-paths . --event-handlers console_direct+
 
 clean: ## remove what the others made
-	rm -rf $(VENV) $(COLCON_VENV) build install log results dist .ros_log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(COLCON_VENV) $(LOCK_VENV) build install log results dist .ros_log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -454,7 +454,7 @@ def make_keystore(
                     file.symlink_to(content)
                     continue
                 mode = 0o600 if name.endswith("key.pem") else 0o644
-                with open(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as out:
+                with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as out:
                     out.write(content)
             sync_tree(work)
             work.rename(place)
