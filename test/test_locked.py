@@ -12,7 +12,7 @@ import pytest
 from packaging.markers import default_environment
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
-from test_platforms import PYTHONS, assigned
+from test_platforms import PYTHONS, assigned, no_index
 
 ROOT = Path(__file__).resolve().parent.parent
 #: What each file is for: lists of setup.py.
@@ -99,11 +99,9 @@ def test_the_files_are_made_for_the_extras_that_the_makefile_names() -> None:
 @pytest.mark.parametrize("name", FILES)
 def test_pip_takes_the_files_and_needs_nothing_besides(name: str, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--quiet"]
-    command += ["--disable-pip-version-check", "--require-hashes", "--only-binary=:all:"]
-    command += ["--target", str(tmp_path), "-r", str(ROOT / "constraints" / name)]
+    command += ["--disable-pip-version-check", "--require-hashes", "--target", str(tmp_path)]
+    command += ["--requirement", str(ROOT / "constraints" / name)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode and re.search(
-        r"Failed to establish|NewConnectionError|timed out|from versions: none", done.stderr
-    ):
+    if done.returncode and no_index(done.stderr, tmp_path):
         pytest.skip("no package index can be reached")
     assert done.returncode == 0, done.stderr

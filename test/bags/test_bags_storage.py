@@ -318,6 +318,20 @@ def test_a_storage_file_that_is_not_listed_is_not_mixed_in_and_is_told(tmp_path)
     assert reader.problems == ["bag_5.mcap is not listed in metadata.yaml; it is not read"]
 
 
+@pytest.mark.parametrize(
+    "name", ["../other/other_0.mcap", "{}/other/other_0.mcap", "./../other/other_0.mcap"]
+)
+def test_a_name_in_metadata_leads_to_no_file_beside_the_bag(tmp_path, name):
+    other = write(tmp_path / "other", messages("/csas/likelihood/camera_info"))
+    assert (other / "other_0.mcap").is_file()
+    path = write(tmp_path / "bag", messages())
+    (path / "bag_0.mcap").rename(path / "bag_1.mcap")
+    edit(path, relative_file_paths=[name.format(tmp_path), "bag_1.mcap"])
+    reader = BagReader(path)
+    assert content(path) == list(messages())
+    assert reader.problems == ["other_0.mcap, listed in metadata.yaml, is missing"]
+
+
 def test_messages_that_metadata_tells_of_and_the_files_lack_are_told(tmp_path):
     path = write(tmp_path / "bag", messages())
     edit(path, message_count=36)
