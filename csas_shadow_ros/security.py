@@ -332,9 +332,10 @@ class _Authority:
         subject = x509.Name([x509.NameAttribute(x509.oid.NameOID.COMMON_NAME, name)])
         issuer = subject if authority else self.certificate.subject
         limit = x509.BasicConstraints(ca=authority, path_length=1 if authority else None)
-        builder = x509.CertificateBuilder(
-            issuer, subject, key.public_key(), x509.random_serial_number(), self.not_before, self.not_after
-        ).add_extension(limit, critical=authority)
+        builder = x509.CertificateBuilder().issuer_name(issuer).subject_name(subject)
+        builder = builder.public_key(key.public_key()).serial_number(x509.random_serial_number())
+        builder = builder.not_valid_before(self.not_before).not_valid_after(self.not_after)
+        builder = builder.add_extension(limit, critical=authority)
         return key, builder.sign(key if authority else self.key, hashes.SHA256())
 
     def sign(self, document: bytes) -> bytes:
