@@ -14,6 +14,7 @@ import numpy as np
 
 from .bags import BagReader, Problem, Run, read_run
 from .bags.metadata import read_metadata
+from .bags.run import sectors_of_one_run
 from .core.errors import BagError, CsasError, check_type
 from .core.geometry import CoherentImage, Track
 from .core.geometry.arcs import Arc, Arcs
@@ -334,13 +335,16 @@ def describe_sectors(run: Run) -> dict[str, Any] | None:
     arcs = Arcs()
     for info in infos:
         arcs.add(Arc(info.aspect_rad - info.aperture_rad / 2.0, info.aperture_rad))
-    first = infos[0]
-    blank = np.broadcast_to(np.complex64(0), first.grid.shape)
+    first, (_, scene) = infos[0], sectors_of_one_run(infos)
+    image = None
+    if scene is not None:
+        blank = np.broadcast_to(np.complex64(0), scene.shape)
+        image = describe_image(CoherentImage(blank, scene, first.acoustics, first.stamp_ns))
     return {
         "count": len(infos),
         "covered_deg": math.degrees(arcs.covered_rad),
         "missing": [str(arc) for arc in arcs.missing()],
-        "image": describe_image(CoherentImage(blank, first.grid, first.acoustics, first.stamp_ns)),
+        "image": image,
     }
 
 

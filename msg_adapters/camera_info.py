@@ -17,9 +17,11 @@ from csas_shadow_ros.core.geometry import (
     TWO_PI,
     Acoustics,
     GroundGrid,
+    GroundLattice,
     ShadowCamera,
     ViewInfo,
     down_range_axis,
+    ground_from_projection,
     wrap_angle,
 )
 from csas_shadow_ros.core.sectors.sector import Sector
@@ -73,20 +75,32 @@ class GroundInfo:
 
 
 @dataclass(frozen=True)
-class SectorInfo(GroundInfo):
+class SectorInfo:
     """Everything about a sector image except its pixels.
 
     Parameters
     ----------
+    stamp_ns : int
+        Stamp, ns.
+    grid : GroundGrid or GroundLattice
+        Its lattice.
+    acoustics : Acoustics
+        Its band.
     aspect_rad, aperture_rad : float
         Centre and width of the arc.
     carrier_rad_m : (float, float)
         Wavenumber (kx, ky), scene axes, that was divided out.
+    frame : str
+        Name of the scene frame.
     """
 
+    stamp_ns: int
+    grid: GroundGrid | GroundLattice
+    acoustics: Acoustics
     aspect_rad: float
     aperture_rad: float
     carrier_rad_m: tuple[float, float]
+    frame: str = field(default=SCENE_FRAME, kw_only=True)
 
     @classmethod
     def of(cls, sector: Sector) -> SectorInfo:
@@ -210,11 +224,17 @@ def _make(
     )
 
 
-def _make_ground(factory: MessageFactory, stamp_ns: int, grid: GroundGrid, model: str, d: list[float]) -> Any:
-    # A camera that looks straight down with north up: R turns y and z round, K is in pixels a metre.
-    k = np.abs(grid.ground_to_pixel)
-    k[:2, 2] = grid.ground_to_pixel[:2, 2]
-    return _make(factory, stamp_ns, grid.shape, model, d, k, np.diag([1.0, -1.0, -1.0]), grid.projection)
+def _make_ground(
+    factory: MessageFactory, stamp_ns: int, grid: GroundGrid | GroundLattice, model: str, d: list[float]
+) -> Any:
+    if isinstance(grid, GroundGrid):
+        # A camera that looks straight down with north up: R turns y and z round, K is in pixels a metre.
+        k = np.abs(grid.ground_to_pixel)
+        k[:2, 2] = grid.ground_to_pixel[:2, 2]
+        r = np.diag([1.0, -1.0, -1.0])
+    else:
+        k = r = np.zeros((3, 3))  # no north-up picture: P alone tells
+    return _make(factory, stamp_ns, grid.shape, model, d, k, r, grid.projection)
 
 
 def ground_info_to_msg(factory: MessageFactory, info: GroundInfo) -> Any:
@@ -258,7 +278,10 @@ def sector_info_from_msg(msg: Any) -> SectorInfo:
     frame = frame_of(msg, where)
     d = _entries(msg, (CSAS_SECTOR,), where)
     stamp = stamp_to_ns(msg.header.stamp, f"{where}.header.stamp")
-    grid, acoustics = _ground_grid(msg, where), _acoustics(d, where)
+    rows, cols = _size(msg, where)
+    with _named(f"{where}.p"):
+        grid = ground_from_projection(_projection(msg, where), rows, cols)
+    acoustics = _acoustics(d, where)
     return SectorInfo(stamp, grid, acoustics, *_aperture(d, where), frame=frame)
 
 

@@ -433,6 +433,18 @@ def data_stamp_to_ns(stamp: Any, where: str) -> int:
     return found
 
 
+def check_data_stamp(stamp_ns: int, where: str) -> None:
+    """Refuse to write an image or a sector that no reader takes: one whose stamp is 0.
+
+    Raises
+    ------
+    AdapterError
+        Naming it.
+    """
+    if stamp_ns == 0:
+        raise AdapterError(f"{where} has stamp 0 ns; expected the time when its last data came")
+
+
 def stamp_from_ns(factory: MessageFactory, stamp_ns: int) -> Any:
     """Make a ``builtin_interfaces/Time``.
 

@@ -27,7 +27,7 @@ from .camera_info import (
     voxel_info_to_msg,
 )
 from .image import image_from_msg, image_to_msg
-from .messages import MessageFactory, data_stamp_to_ns, stamp_to_ns
+from .messages import MessageFactory, check_data_stamp, data_stamp_to_ns, stamp_to_ns
 from .topics import stream
 
 
@@ -49,7 +49,14 @@ def coherent_image_from_msgs(image: Any, info: Any) -> CoherentImage:
 def coherent_image_to_msgs(
     factory: MessageFactory, image: CoherentImage, encoding: str | None = None
 ) -> tuple[Any, Any]:
-    """Make (Image, CameraInfo) of the full-circle image."""
+    """Make (Image, CameraInfo) of the full-circle image.
+
+    Raises
+    ------
+    AdapterError
+        If its stamp is 0, or it breaks the contract otherwise.
+    """
+    check_data_stamp(image.stamp_ns, "image")
     info = GroundInfo(image.stamp_ns, image.grid, image.acoustics, frame=image.frame)
     return (
         image_to_msg(factory.in_frame(image.frame), image.pixels, image.stamp_ns, "image", encoding),
@@ -74,7 +81,14 @@ def sector_from_msgs(image: Any, info: Any) -> Sector:
 
 
 def sector_to_msgs(factory: MessageFactory, sector: Sector, encoding: str | None = None) -> tuple[Any, Any]:
-    """Make (Image, CameraInfo) of a sector."""
+    """Make (Image, CameraInfo) of a sector.
+
+    Raises
+    ------
+    AdapterError
+        If its stamp is 0, or it breaks the contract otherwise.
+    """
+    check_data_stamp(sector.stamp_ns, "sector")
     return (
         image_to_msg(factory.in_frame(sector.frame), sector.pixels, sector.stamp_ns, "sector", encoding),
         sector_info_to_msg(factory, SectorInfo.of(sector)),

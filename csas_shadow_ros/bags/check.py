@@ -221,7 +221,7 @@ class _Check:
         relative = problem.topic.removeprefix(f"{self.reader.namespace}/")
         topic = TOPICS.get(relative)
         if problem.number is None and problem.stamp_ns is not None:
-            remedy = "Let all sectors share one grid and one band: they are added up."
+            remedy = "Let all sectors share one band, hold it, and cover the same ground: they are added up."
         elif problem.number is None:
             remedy = f"Publish {problem.topic} as {topic.type_name}." if topic else ""
         elif "of the same stamp" in problem.reason and "has no" in problem.reason:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -12,11 +13,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from csas_shadow_ros.core.errors import BagError, CsasError, check_type
-from csas_shadow_ros.core.geometry import CoherentImage, Datum, Origin, Track, View
-from csas_shadow_ros.core.sectors.sector import Sector, unlike
+from csas_shadow_ros.core.geometry import CoherentImage, Datum, GroundGrid, GroundLattice, Origin, Track, View
+from csas_shadow_ros.core.sectors.sector import Sector, scene_of, unfit, unlike
 from msg_adapters.camera_info import SectorInfo, sector_info_from_msg
 from msg_adapters.image import largest_part, quantise
-from msg_adapters.messages import SCENE_FRAME, RosbagsMessages
+from msg_adapters.messages import SCENE_FRAME, RosbagsMessages, check_data_stamp
 from msg_adapters.origin import origin_to_msg
 from msg_adapters.pairs import (
     coherent_image_from_msgs,
@@ -174,15 +175,15 @@ class Run:
         from csas_shadow_ros.core.sectors.streaming import SectorSum
 
         if self._sum is None:
-            total = SectorSum()
             topic = absolute_name(stream("sector").image_topic, self.namespace)
-            odd = odd_sectors(self.sector_infos())
+            odd, scene = sectors_of_one_run(self.sector_infos())
+            total = SectorSum(scene=scene)
             for sector in self.sectors():
                 if sector.stamp_ns in odd:
                     self.report(Problem(topic, None, sector.stamp_ns, odd[sector.stamp_ns]))
                     continue
                 try:
-                    total.add(sector)
+                    total.add(sector, None if self.track is None else self.track.grazing_rad)
                 except CsasError as error:
                     self.problems.append(Problem(topic, None, sector.stamp_ns, str(error)))
             if not total.stamps:
@@ -286,6 +287,11 @@ class Run:
 
 def odd_sectors(infos: Iterable[SectorInfo]) -> dict[int, str]:
     """Return, by stamp, why a sector is not like most: one that is wrong must not make the others wrong."""
+    return sectors_of_one_run(infos)[0]
+
+
+def sectors_of_one_run(infos: Iterable[SectorInfo]) -> tuple[dict[int, str], GroundGrid | None]:
+    """Return what is wrong with the odd ones, by stamp, and the lattice that the rest add up on."""
     kinds: list[list[SectorInfo]] = []
     for info in infos:
         for kind in kinds:
@@ -294,8 +300,8 @@ def odd_sectors(infos: Iterable[SectorInfo]) -> dict[int, str]:
                 break
         else:
             kinds.append([info])
-    if len(kinds) < 2:
-        return {}
+    if not kinds:
+        return {}, None
     most = max(kinds, key=len)
     reasons: dict[int, str] = {}
     for kind in kinds:
@@ -303,7 +309,32 @@ def odd_sectors(infos: Iterable[SectorInfo]) -> dict[int, str]:
             what, values = differs
             reason = f"has another {what} than {len(most)} other sectors: {values}"
             reasons |= {info.stamp_ns: reason for info in kind}
-    return reasons
+    scenes: list[tuple[GroundGrid, int]] = []
+    for info in most:
+        for n, (scene, count) in enumerate(scenes):
+            if _same_ground(info, scene):
+                scenes[n] = scene, count + 1
+                break
+        else:
+            try:
+                scenes.append((scene_of(info), 1))
+            except CsasError as error:
+                reasons[info.stamp_ns] = str(error)
+    if not scenes:
+        return reasons, None
+    scene, count = max(scenes, key=lambda one: one[1])
+    for info in most:
+        if info.stamp_ns not in reasons and (fault := unfit(info, scene)):
+            reasons[info.stamp_ns] = f"is not like {count} other sectors: {fault}"
+    return reasons, scene
+
+
+def _same_ground(info: SectorInfo, scene: GroundGrid) -> bool:
+    """Say whether a sector covers the ground of a scene and no more, to a pixel of its own."""
+    lattice = GroundLattice.of(info.grid)
+    (ax, ay), (bx, by) = lattice.column_step_m, lattice.row_step_m
+    pixel = max(math.hypot(ax, ay), math.hypot(bx, by))
+    return all(abs(a - b) <= pixel for a, b in zip(lattice.extent_m, scene.extent_m, strict=True))
 
 
 def read_run(path: str | Path, namespace: str | None = None, run: int | None = None) -> Run:
@@ -455,6 +486,8 @@ def write_run(
     check_type("track", track, (Track, type(None)), "a Track or None")
     if encoding not in COMPLEX_ENCODINGS:
         raise BagError(f"encoding is {encoding!r}; expected one of: {', '.join(COMPLEX_ENCODINGS)}")
+    if image is not None:
+        check_data_stamp(image.stamp_ns, "image")  # before a bag that is there is replaced
     integers = encoding in ("8SC2", "16SC2")
     factory = RosbagsMessages()
     # Everything of the run was known when its last pose was: nothing waits when the bag is played.

@@ -70,6 +70,12 @@ def _simulate_options(p: argparse.ArgumentParser) -> None:
         help="write sectors of so much arc, as they come during a run, instead of the image",
     )
     p.add_argument(
+        "--sector-lattice",
+        choices=("image", "own"),
+        default="image",
+        help="lattice of those sectors: the image's (default), or each the coarsest that holds its arc",
+    )
+    p.add_argument(
         "--spectrum-sign",
         type=int,
         choices=(1, -1),
@@ -220,6 +226,7 @@ def _simulate(arguments: argparse.Namespace, console: Console) -> int:
             encoding=arguments.encoding,
             overwrite=arguments.overwrite,
             sectors_deg=arguments.sectors,
+            sector_lattice=arguments.sector_lattice,
             datum=datum,
             frame=arguments.scene_frame,
         )

@@ -20,6 +20,7 @@ def simulate_bag(
     encoding: str = "32FC2",
     overwrite: bool = False,
     sectors_deg: float = 0.0,
+    sector_lattice: str = "image",
     datum: Datum | None = None,
     **kwargs: Any,
 ) -> SimulatedRun:
@@ -37,6 +38,8 @@ def simulate_bag(
         Replace a bag that is there.
     sectors_deg : float
         Write the image as sectors of so much arc, as they would come during the run; 0: as it is.
+    sector_lattice : {'image', 'own'}
+        Lattice of those sectors: the image's, or each on the coarsest one that holds its band.
     datum : Datum, optional
         Where on earth the scene's origin is, for topic ``origin``.
 
@@ -68,7 +71,7 @@ def simulate_bag(
         times: dict[int, int] = {}
 
         def timed() -> Iterator[Sector]:
-            for sector, when in sectors_of_run(run.image, run.track, sectors_deg):
+            for sector, when in sectors_of_run(run.image, run.track, sectors_deg, sector_lattice):
                 times[sector.stamp_ns] = when
                 yield sector
 

@@ -129,10 +129,23 @@ def test_a_pause_of_days_is_no_reason_to_leave_half_of_a_path_out(track):
 
 def test_an_image_and_a_sector_that_nobody_stamped_are_refused(coherent, sector):
     for made, read in (
-        (coherent_image_to_msgs(FACTORY, replace(coherent, stamp_ns=0)), coherent_image_from_msgs),
-        (sector_to_msgs(FACTORY, replace(sector, stamp_ns=0)), sector_from_msgs),
+        (coherent_image_to_msgs(FACTORY, coherent), coherent_image_from_msgs),
+        (sector_to_msgs(FACTORY, sector), sector_from_msgs),
     ):
+        for message in made:
+            message.header.stamp.sec = message.header.stamp.nanosec = 0
         with pytest.raises(
             AdapterError, match=r"header\.stamp is 0; expected the time when its last data came"
         ):
             read(*made)
+
+
+def test_an_image_and_a_sector_without_a_stamp_are_not_written(coherent, sector):
+    for write, what, name in (
+        (coherent_image_to_msgs, coherent, "image"),
+        (sector_to_msgs, sector, "sector"),
+    ):
+        with pytest.raises(
+            AdapterError, match=f"^{name} has stamp 0 ns; expected the time when its last data came$"
+        ):
+            write(FACTORY, replace(what, stamp_ns=0))

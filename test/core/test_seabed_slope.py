@@ -37,9 +37,7 @@ def ends_of(top, gradient=(0.0, 0.0), too_high_m=0.0, keep=lambda _: True):
     return ends
 
 
-corners = st.lists(
-    st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6)), min_size=1, max_size=7, unique=True
-)
+corners = st.lists(st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6)), min_size=1, max_size=7, unique=True)
 slopes = st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05))
 
 

@@ -28,9 +28,7 @@ from csas_shadow_ros.simulation.sectors import sectors_of_run
 AUTO = PipelineParameters(
     sub_aperture=SubApertureParameters(step_deg=10.0), carving=CarvingParameters(voxel_size_m=0.05)
 )
-GIVEN = replace(
-    AUTO, target=TargetParameters(target="given", position_m=(0.2, -0.1), size_m=(1.5, 1.5, 0.7))
-)
+GIVEN = replace(AUTO, target=TargetParameters(target="given", position_m=(0.2, -0.1), size_m=(1.5, 1.5, 0.7)))
 
 
 @pytest.fixture(scope="module")
@@ -254,9 +252,7 @@ def test_a_sector_that_cannot_be_used_is_named_and_the_sum_goes_on(sectors, chan
 
 def test_energy_beyond_its_arc_is_summed_too(sectors):
     image = band_limited_image()
-    thirds = [
-        Sector(image.pixels / 3, image.grid, image.acoustics, 1 + i, float(i), 0.1) for i in range(3)
-    ]
+    thirds = [Sector(image.pixels / 3, image.grid, image.acoustics, 1 + i, float(i), 0.1) for i in range(3)]
     total = sum_of(thirds)
     assert total.margin_rad == math.pi, "every view waits for all of them"
     assert np.abs(total.image().pixels - image.pixels).max() < 1e-5 * np.abs(image.pixels).max()

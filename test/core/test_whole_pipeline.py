@@ -156,9 +156,7 @@ def test_a_position_that_is_given_is_used_and_sizes_given_override(box_run):
     given = found_in(box_run.image, box_run.track, GIVEN)
     assert given.position_m == (0.1, -0.15)
     assert given.size_m == (0.8, 0.7, 0.4)
-    auto = found_in(
-        box_run.image, box_run.track, TargetParameters(target="given", position_m=(0.12, -0.1))
-    )
+    auto = found_in(box_run.image, box_run.track, TargetParameters(target="given", position_m=(0.12, -0.1)))
     assert auto.position_m == (0.12, -0.1)
     assert all(s > 0.2 for s in auto.size_m)
     some = found_in(box_run.image, box_run.track, TargetParameters(size_m=(0.0, 0.0, 0.33)))

@@ -44,12 +44,22 @@ def add(archive: Path, name: str, results: Path | None, place: Any = None, reaso
         shutil.copytree(results, folder / "results")
         report = json.loads((folder / "results" / "report.json").read_text())
         latitude, longitude = place or (0.0, 0.0)
-        origin = {"latitude_deg": latitude, "longitude_deg": longitude, "heading_deg": 0.0, "altitude_m": 0.0, "covariance_m2": None}
+        origin = {
+            "latitude_deg": latitude,
+            "longitude_deg": longitude,
+            "heading_deg": 0.0,
+            "altitude_m": 0.0,
+            "covariance_m2": None,
+        }
         report["datum"] = origin if place else None
         for entry in report["objects"]:
-            entry["place"] = {"latitude_deg": latitude, "longitude_deg": longitude, "bearing_deg": 10.0} if place else None
+            entry["place"] = (
+                {"latitude_deg": latitude, "longitude_deg": longitude, "bearing_deg": 10.0} if place else None
+            )
         (folder / "results" / "report.json").write_text(json.dumps(report))
-    Record(f"/bags/{name}", f"{name:0>64}", "s", "o", "1", 1, [PartOfTask(reason=reason)]).write(folder, durable=False)
+    Record(f"/bags/{name}", f"{name:0>64}", "s", "o", "1", 1, [PartOfTask(reason=reason)]).write(
+        folder, durable=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +191,10 @@ def test_so_many_runs_are_open_at_once_and_end_with_the_archive(serve_archive: A
     server = serve_archive()
     own = server.url.rstrip("/")
     results = [row["results"] for row in json.loads(ask(f"{own}/api/rows?verdict=object")[1])["rows"]]
-    urls = [json.loads(ask(f"{own}/api/open", {"results": r}, Origin=own)[1])["url"] for r in (*results, results[-1])]
+    urls = [
+        json.loads(ask(f"{own}/api/open", {"results": r}, Origin=own)[1])["url"]
+        for r in (*results, results[-1])
+    ]
     assert len(set(urls)) == 3
     assert urls[-1] == urls[-2]
     assert ask(urls[-1])[0] == 200
@@ -232,7 +245,9 @@ def test_the_page_shows_filters_and_opens(watched: Any, serve_archive: Any) -> N
 
 def test_the_command_shows_an_archive_until_it_is_told_to_end(season: Path, capsys: Any) -> None:
     command = [sys.executable, "-m", "csas_shadow_ros", "view", str(season), "--no-browser"]
-    running = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)}, cwd="/")
+    running = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)}, cwd="/"
+    )
     url = running.stdout.readline().strip()
     assert json.loads(ask(f"{url}api/rows")[1])["count"] == 4
     running.send_signal(signal.SIGINT)

@@ -27,6 +27,7 @@ from .frames import (
     unit_to_sonar,
     wrap_angle,
 )
+from .lattice import GroundLattice, ground_from_projection
 from .passage import Passage, passage
 from .place import Datum, Origin, Place, origin_of
 from .runs import TrackBook, TrackPiece
@@ -53,6 +54,7 @@ __all__ = [
     "DoubtfulArc",
     "FloatArray",
     "GroundGrid",
+    "GroundLattice",
     "Origin",
     "Passage",
     "Place",
@@ -66,6 +68,7 @@ __all__ = [
     "cross_range_axis",
     "down_range_axis",
     "fit_target_to_focus",
+    "ground_from_projection",
     "looks_at",
     "one_frame",
     "origin_of",

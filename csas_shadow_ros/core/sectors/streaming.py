@@ -19,7 +19,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from ..errors import GeometryError, NoTargetError, ViewError
-from ..geometry import TWO_PI, CoherentImage, Track
+from ..geometry import TWO_PI, CoherentImage, GroundGrid, Track
 from ..geometry.arcs import TOLERANCE_RAD, Arc, Arcs
 from ..geometry.passage import passage
 from ..imaging.subaperture import Spectrum, SubApertures
@@ -27,7 +27,8 @@ from ..kernels import kernel
 from ..parameters import MAX_OBJECTS, PipelineParameters, SubApertureParameters, TargetParameters
 from ..search.decision import Decision, decide_by_image
 from ..shape.volume import Target, VoxelGrid
-from .sector import Sector, unlike
+from .sector import LEAST_COSINE, Sector, same_grid, scene_of, unfit, unlike
+from .sector_lattice import coefficients
 
 if TYPE_CHECKING:
     from ..pipeline import ProcessedView
@@ -39,8 +40,6 @@ _EDGE_RAD = 1e-4
 #: So much of a sector's energy may lie beyond its arc and be left out: nothing but rounding at the edge
 #: itself; and -30 dB of sidelobes and rounded pixels half a sector further out.
 _BEYOND_EDGE, _BEYOND_HALF = 1e-6, 1e-3
-#: A wavenumber under this fraction of the band's lower edge would need a grazing angle over 66°.
-_LEAST_COSINE = 0.4
 #: After a search that found nothing the next one waits for so much more arc.
 _SEARCH_AGAIN_RAD = math.radians(30.0)
 
@@ -90,6 +89,16 @@ def _cut(spectrum: NDArray[np.complex64], first: int, count: int, axis: int) -> 
     return np.concatenate(found, axis) if len(found) > 1 else found[0]
 
 
+def _on_scene(
+    sector: Sector, scene: GroundGrid, box: NDArray[np.complex64], first: tuple[int, int], workers: int
+) -> Sector:
+    """Return a sector on the scene's lattice and on its carrier, by its coefficients there."""
+    spectrum = np.zeros(scene.shape, np.complex64)
+    _arc_of_box(box, first, (1.0, 1.0), 0.0, 0.0, True, spectrum)
+    pixels = scipy.fft.ifft2(spectrum, norm="forward", overwrite_x=True, workers=workers)
+    return replace(sector, pixels=pixels, grid=scene, carrier_rad_m=(0.0, 0.0))
+
+
 def uncovered(arcs: Arcs, track: Track) -> list[Arc]:
     """Return the arcs that a track goes through, but no sector covers."""
     return [
@@ -106,6 +115,8 @@ class SectorSum:
     ----------
     workers : int
         Threads of the transforms.
+    scene : GroundGrid, optional
+        The full-circle image's lattice; by default what the first sector tells of it (`scene_of`).
 
     Notes
     -----
@@ -113,11 +124,14 @@ class SectorSum:
     energy ends sharply, half its width where it does not. Every bin then gets at most two sectors of a
     partition, whose sum does not depend on their order. A sector whose energy lies elsewhere is added whole.
 
-    One spectrum of the image's size is held, however many sectors come.
+    One spectrum of the image's size is held, however many sectors come. A sector on a lattice of its own is
+    taken to that spectrum's bins without an image of the scene's size in between (`sector_lattice`).
     """
 
-    def __init__(self, workers: int = 2) -> None:
+    def __init__(self, workers: int = 2, *, scene: GroundGrid | None = None) -> None:
         self._workers = workers
+        self._scene = scene
+        #: The first sector, on the scene's lattice, without its pixels.
         self._first: Sector | None = None
         self._spectrum: Spectrum | None = None
         self.arcs = Arcs()
@@ -132,6 +146,7 @@ class SectorSum:
         total = cls(workers)
         blank = np.broadcast_to(np.complex64(0), image.grid.shape)
         whole = Sector(blank, image.grid, image.acoustics, image.stamp_ns, 0.0, TWO_PI, frame=image.frame)
+        total._scene = image.grid
         total._first, total._spectrum = whole, Spectrum.of_image(image, workers)
         total.stamps.add(image.stamp_ns)
         total.arcs.add(Arc(0.0, TWO_PI))
@@ -158,11 +173,10 @@ class SectorSum:
     @property
     def frame(self) -> CoherentImage:
         """The image's lattice and band, with pixels that take no memory and hold nothing."""
-        if self._first is None:
+        first, scene = self._first, self._scene
+        if first is None or scene is None:
             raise GeometryError("there are no sectors to sum; expected at least one")
-        first = self._first
-        blank = np.broadcast_to(np.complex64(0), first.grid.shape)
-        return CoherentImage(blank, first.grid, first.acoustics, self.newest_ns, frame=first.frame)
+        return CoherentImage(first.pixels, scene, first.acoustics, self.newest_ns, frame=first.frame)
 
     def image(self) -> CoherentImage:
         """Transform the sum back to the coherent image, stamped with the last sector's stamp."""
@@ -171,8 +185,15 @@ class SectorSum:
         rows, cols = frame.grid.shape
         return replace(frame, pixels=np.ascontiguousarray(pixels[:rows, :cols]))
 
-    def add(self, sector: Sector) -> Arc | None:
+    def add(self, sector: Sector, grazing_rad: float | None = None) -> Arc | None:
         """Add a sector.
+
+        Parameters
+        ----------
+        sector : Sector
+            The sector.
+        grazing_rad : float, optional
+            The track's mean grazing angle, where it is known: it tells whether a lattice folds its arc.
 
         Returns
         -------
@@ -182,11 +203,12 @@ class SectorSum:
         Raises
         ------
         GeometryError
-            If its grid or band is not the first one's, its arc is no arc, or a pixel is not finite.
+            If its band is not the first one's, its lattice folds its arc or covers less than the scene, its
+            arc is no arc, or a pixel is not finite.
         """
         if sector.stamp_ns in self.stamps:
             return None
-        self._check(sector)
+        scene = self._check(sector, grazing_rad)
         pixels = np.ascontiguousarray(sector.pixels, np.complex64)
         empty = np.empty((0, 0), np.complex64)
         energy = _arc_of_box(pixels, (0, 0), (1.0, 1.0), 0.0, 0.0, True, empty) / pixels.size
@@ -198,9 +220,10 @@ class SectorSum:
                 " expected finite numbers"
             )
         if self._spectrum is None:
-            shape = tuple(scipy.fft.next_fast_len(n) for n in sector.grid.shape)
-            self._first = replace(sector, pixels=np.broadcast_to(np.complex64(0), sector.grid.shape))
-            self._spectrum = Spectrum(np.zeros(shape, np.complex64), sector.grid)
+            shape = tuple(scipy.fft.next_fast_len(n) for n in scene.shape)
+            blank = np.broadcast_to(np.complex64(0), scene.shape)
+            self._scene, self._first = scene, replace(sector, pixels=blank, grid=scene)
+            self._spectrum = Spectrum(np.zeros(shape, np.complex64), scene)
         arc = Arc(sector.aspect_rad - sector.aperture_rad / 2.0, sector.aperture_rad)
         margin = self._add(sector, arc, energy)
         self.stamps.add(sector.stamp_ns)
@@ -208,31 +231,45 @@ class SectorSum:
         self.margin_rad = max(self.margin_rad, margin)
         return arc.widened(margin)
 
-    def _check(self, sector: Sector) -> None:
+    def _check(self, sector: Sector, grazing_rad: float | None) -> GroundGrid:
+        """Refuse a sector that cannot be of this sum; return the scene's lattice."""
+        name = f"sector at {sector.stamp_ns} ns"
         if not 0.0 < sector.aperture_rad <= TWO_PI * (1.0 + 1e-9) or not math.isfinite(sector.aspect_rad):
             raise GeometryError(
-                f"sector at {sector.stamp_ns} ns has aspect {math.degrees(sector.aspect_rad):g}° and aperture"
+                f"{name} has aspect {math.degrees(sector.aspect_rad):g}° and aperture"
                 f" {math.degrees(sector.aperture_rad):g}°; expected an arc of more than 0° and at most 360°"
             )
         first = self._first
-        if first is None:
-            return
-        if differs := unlike(sector, first):
+        if first is not None and (differs := unlike(sector, first)):
             what, values = differs
-            raise GeometryError(
-                f"sector at {sector.stamp_ns} ns has another {what} than the first, at"
-                f" {first.stamp_ns} ns: {values}"
-            )
+            raise GeometryError(f"{name} has another {what} than the first, at {first.stamp_ns} ns: {values}")
+        try:
+            scene = self._scene or scene_of(sector)
+        except GeometryError as error:
+            raise GeometryError(f"{name}: {error}") from error
+        if fault := unfit(sector, scene, grazing_rad):
+            raise GeometryError(f"{name}: {fault}")
+        return scene
 
     def _add(self, sector: Sector, arc: Arc, energy: float) -> float:
         """Add a sector's arc of the spectrum; return how far it reaches beyond the sector's."""
-        values, steps = self.spectrum.values, self.spectrum.step_rad_m
-        turn = 0.0 if sector.acoustics.spectrum_sign > 0 else math.pi
-        empty = np.empty((0, 0), np.complex64)
+        values, steps, scene = self.spectrum.values, self.spectrum.step_rad_m, self.spectrum.grid
         half = arc.width_rad / 2.0
+        narrow = arc.width_rad + 2.0 * half < math.pi
+        if not (isinstance(sector.grid, GroundGrid) and same_grid(sector.grid, scene)):
+            box, first = coefficients(sector, scene, self._workers)
+            if values.shape == scene.shape:
+                energy = float(np.vdot(box, box).real)
+                if narrow and (margin := self._add_arc(box, first, arc, energy)) is not None:
+                    return margin
+                _arc_of_box(box, first, steps, 0.0, 0.0, True, values)
+                return math.pi
+            sector = _on_scene(sector, scene, box, first, self._workers)
+            energy = float(np.vdot(sector.pixels, sector.pixels).real) / sector.pixels.size
         # The image's energy and its zero-padded transform's differ by the padding.
         energy *= sector.pixels.size / values.size
-        if arc.width_rad + 2.0 * half < math.pi:
+        if narrow:
+            turn = 0.0 if sector.acoustics.spectrum_sign > 0 else math.pi
             first, shape = self._box(arc.widened(half), turn)
             along_x, along_y = sector.carrier()
             rows = np.asarray(sector.pixels * along_x[None, :], np.complex64)
@@ -240,16 +277,27 @@ class SectorSum:
             # The carrier along the other axis need only be put on the columns that are kept.
             columns = _cut(rows, first[1], shape[1], 1) * along_y[:, None]
             spectrum = scipy.fft.fft(columns, values.shape[0], 0, "forward", True, workers=self._workers)
-            box = _cut(spectrum, first[0], shape[0], 0)
-            for margin, beyond in ((_EDGE_RAD, _BEYOND_EDGE), (half, _BEYOND_HALF)):
-                low = arc.start_rad - margin + turn
-                high = low + arc.width_rad + 2.0 * margin
-                if _arc_of_box(box, first, steps, low, high, False, empty) >= (1.0 - beyond) * energy:
-                    _arc_of_box(box, first, steps, low, high, False, values)
-                    return margin
+            margin = self._add_arc(_cut(spectrum, first[0], shape[0], 0), first, arc, energy)
+            if margin is not None:
+                return margin
         pixels = np.asarray(sector.on_carrier(), np.complex64)
         values += scipy.fft.fft2(pixels, values.shape, norm="forward", workers=self._workers)
         return math.pi
+
+    def _add_arc(
+        self, box: NDArray[np.complex64], first: tuple[int, int], arc: Arc, energy: float
+    ) -> float | None:
+        """Add an arc of a box of a sector's spectrum; None if the sector's energy lies elsewhere."""
+        values, steps = self.spectrum.values, self.spectrum.step_rad_m
+        turn = 0.0 if self.frame.acoustics.spectrum_sign > 0 else math.pi
+        empty = np.empty((0, 0), np.complex64)
+        for margin, beyond in ((_EDGE_RAD, _BEYOND_EDGE), (arc.width_rad / 2.0, _BEYOND_HALF)):
+            low = arc.start_rad - margin + turn
+            high = low + arc.width_rad + 2.0 * margin
+            if _arc_of_box(box, first, steps, low, high, False, empty) >= (1.0 - beyond) * energy:
+                _arc_of_box(box, first, steps, low, high, False, values)
+                return margin
+        return None
 
     def _box(self, arc: Arc, turn: float) -> tuple[tuple[int, int], tuple[int, int]]:
         """Return (first row, column) and the shape of the spectrum's box round an arc of the band."""
@@ -262,10 +310,7 @@ class SectorSum:
         quarters = np.arange(math.ceil(angles[0] / (math.pi / 2)), math.floor(angles[-1] / (math.pi / 2)) + 1)
         angles = np.concatenate([angles, quarters * (math.pi / 2)])
         rim = np.concatenate(
-            [
-                k * np.exp(1j * angles)
-                for k in (_LEAST_COSINE * low, min(1.1 * high, math.sqrt(2.0) * nyquist))
-            ]
+            [k * np.exp(1j * angles) for k in (LEAST_COSINE * low, min(1.1 * high, math.sqrt(2.0) * nyquist))]
         )
         row, col = -rim.imag / steps[0], rim.real / steps[1]
         limits = []
@@ -387,7 +432,7 @@ class Stream:
             If it does not belong to the others.
         """
         newest = self.sum.newest_ns
-        changed = self.sum.add(sector)
+        changed = self.sum.add(sector, None if self.track is None else self.track.grazing_rad)
         if changed is None:
             self.counts["repeated"] += 1
             return False
