@@ -778,10 +778,10 @@ def judge_view(view: View, track: Track) -> Iterator[tuple[str, str, str]]:
 def check_spectrum_sign(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, str]]:
     """Yield (level, problem, remedy) if the image contradicts its stated spectrum sign."""
     # Imported here: a bag of views is checked without the weight of the whole method.
-    from csas_shadow_ros.core.search.bodies import spectrum_sign_evidence
+    from csas_shadow_ros.core.search.bodies import LEAVES, spectrum_sign_evidence
 
     try:
-        evidence, _ = spectrum_sign_evidence(image, track)
+        evidence, search = spectrum_sign_evidence(image, track)
     except CsasError as error:
         yield WARNING, f"the spectrum sign cannot be checked: {error}", ""
         return
@@ -793,3 +793,11 @@ def check_spectrum_sign(image: CoherentImage, track: Track) -> Iterator[tuple[st
         )
     else:
         yield INFO, str(evidence), ""
+    for left in () if search is None else search.left_out:
+        if left.reason.startswith(LEAVES):
+            x, y = left.position_m
+            yield (
+                WARNING,
+                f"something stands at ({x + 0.0:.2f}, {y + 0.0:.2f}) m: {left.reason}",
+                "Process a larger scene: nothing can be said of a body whose shadows are not on the image.",
+            )

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from csas_shadow_ros.core.geometry import Acoustics, GroundGrid, ShadowCamera, ViewInfo, view_ground_to_pixel
+from csas_shadow_ros.core.geometry import (
+    Acoustics,
+    GroundGrid,
+    GroundLattice,
+    ShadowCamera,
+    ViewInfo,
+    view_ground_to_pixel,
+)
 from csas_shadow_ros.core.shape.volume import Volume
 from msg_adapters import (
     AdapterError,
@@ -48,6 +56,20 @@ def test_the_full_image_survives_the_round_trip(factory, coherent):
     np.testing.assert_array_equal(back.pixels, coherent.pixels)
     assert same_grid(back.grid, coherent.grid)
     assert (back.acoustics, back.stamp_ns) == (coherent.acoustics, coherent.stamp_ns)
+
+
+def test_a_sector_on_a_turned_lattice_with_oblong_pixels_survives_the_round_trip(factory, sector):
+    lattice = GroundLattice(12, 17, (1.5, -2.25), (0.03, 0.04), (0.016, -0.012))
+    image, info = sector_to_msgs(factory, replace(sector, grid=lattice))
+    back = sector_from_msgs(image, info)
+    assert isinstance(back.grid, GroundLattice)
+    np.testing.assert_allclose(back.grid.pixel_to_ground, lattice.pixel_to_ground, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(back.pixels, sector.pixels)
+    info.p[0] *= -1.0
+    info.p[1] *= -1.0
+    info.p[3] *= -1.0
+    with pytest.raises(AdapterError, match=r"sector/camera_info\.p: .*mirrored"):
+        sector_from_msgs(image, info)
 
 
 def test_a_sector_survives_the_round_trip(factory, sector):

@@ -11,7 +11,7 @@ import pytest
 
 from csas_shadow_ros.bags import BagReader, check_bag, read_run, write_run
 from csas_shadow_ros.cli import main
-from csas_shadow_ros.core.geometry import GroundGrid, Track
+from csas_shadow_ros.core.geometry import GroundGrid, GroundLattice, Track
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.sectors.sector import Sector
 from csas_shadow_ros.nodes.playing import BagViews
@@ -53,6 +53,57 @@ def test_right_sectors_are_usable_and_told_of(run, sectors, tmp_path, capsys) ->
     told = capsys.readouterr().out
     assert "sectors 12 that cover 360.0 of 360°" in told
     assert "image (summed from the sectors)" in told
+
+
+@pytest.fixture(scope="module")
+def own_sectors(run):
+    return [sector for sector, _ in sectors_of_run(run.image, run.track, 30.0, "own")]
+
+
+def test_sectors_on_own_lattices_are_usable_and_told_of(run, own_sectors, tmp_path, capsys) -> None:
+    bag = written(tmp_path / "own", run, own_sectors)
+    report = check_bag(bag)
+    assert report.ok
+    assert texts(report, "warning") == ""
+    assert "away from the sonar, as they must" in texts(report, "info")
+    assert main(["info", str(bag)]) == 0
+    assert "image (summed from the sectors)" in capsys.readouterr().out
+    total = read_run(bag).sector_sum()
+    assert total.stamps == {sector.stamp_ns for sector in own_sectors}
+    np.testing.assert_allclose(total.frame.grid.extent_m, run.image.grid.extent_m, atol=1e-9)
+
+
+@pytest.mark.parametrize("wrong", [0, 5])
+@pytest.mark.parametrize("what", ["folded", "too small"])
+def test_one_own_lattice_that_is_wrong_is_named_and_the_others_are_summed(
+    run, own_sectors, tmp_path, what, wrong
+) -> None:
+    odd = list(own_sectors)
+    one = odd[wrong]
+    lattice = GroundLattice.of(one.grid)
+    if what == "folded":
+        # Every fourth row over the same ground: 30° of the band no longer fit between them.
+        (x, y), (bx, by) = lattice.origin_m, lattice.row_step_m
+        rows = one.pixels[::4]
+        grid = replace(lattice, rows=len(rows), row_step_m=(4 * bx, 4 * by), origin_m=(x, y + 1.5 * by))
+        odd[wrong] = replace(one, pixels=rows, grid=grid)
+        said = "fold the band of its arc"
+    else:
+        half = one.pixels[: lattice.rows // 2]
+        odd[wrong] = replace(one, pixels=half, grid=replace(lattice, rows=len(half)))
+        said = "expected all of the scene"
+    bag = written(tmp_path / "odd", run, odd)
+    found = read_run(bag)
+    right = read_run(written(tmp_path / "rest", run, [s for i, s in enumerate(own_sectors) if i != wrong]))
+    np.testing.assert_allclose(
+        found.sector_sum().spectrum.values, right.sector_sum().spectrum.values, atol=1e-5
+    )
+    [problem] = found.problems
+    assert said in str(problem)
+    assert "\n" not in str(problem)
+    report = check_bag(bag)
+    assert not report.ok
+    assert said in texts(report, "error")
 
 
 def test_a_band_that_is_worked_out_anew_for_each_sector_is_the_same_band(run, sectors, tmp_path) -> None:

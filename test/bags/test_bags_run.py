@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -574,3 +575,14 @@ def test_what_was_written_before_an_error_is_a_sound_bag(tmp_path, image, track)
     run = read_run(tmp_path / "run")
     same_image(run.image, image)
     assert run.problems == []
+
+
+def test_an_image_or_a_sector_without_a_stamp_is_not_written_and_replaces_no_bag(tmp_path, tiny_box_bag):
+    run = read_run(tiny_box_bag.path)
+    there = write_run(tmp_path / "there", run.image, run.track)
+    with pytest.raises(AdapterError, match="image has stamp 0 ns; expected the time when its last data came"):
+        write_run(there, replace(run.image, stamp_ns=0), run.track, overwrite=True)
+    assert read_run(there).image.stamp_ns == run.image.stamp_ns
+    sector = Sector(run.image.pixels, run.image.grid, run.image.acoustics, 0, 0.0, 1.0)
+    with pytest.raises(AdapterError, match="sector has stamp 0 ns"):
+        write_run(tmp_path / "new", None, run.track, sectors=[sector])

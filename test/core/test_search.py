@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
 import trimesh
 
+from csas_shadow_ros.bags.check import WARNING, check_spectrum_sign
 from csas_shadow_ros.core.errors import SpectrumSignError
 from csas_shadow_ros.core.imaging.subaperture import Spectrum
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters, TargetParameters
@@ -45,6 +47,28 @@ def test_bodies_still_tell_a_wrong_sign(target):
     assert evidence.verdict == "wrong"
     with pytest.raises(SpectrumSignError, match=r"expected \+1"):
         run(image, right.track, COARSE)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_body_whose_shadows_leave_the_image_is_undecided_and_check_says_so_before(sign):
+    # 1.8 m of cylinder, 0.52 m high, on an image of 2.56 m: its shadows reach 2.2 m from the middle.
+    made = simulate("tiny", "cylinder", seed=1, heading_deg=30.0, spectrum_sign=sign)
+    result = run(made.image, made.track, COARSE)
+    assert (result.verdict, result.quality.verdict) == ("undecided", "not trustworthy")
+    (left,) = result.left_out
+    assert max(map(abs, left.position_m)) < 0.2, "where it stands"
+    found = re.search(r"shadow leaves the image in \d+ of 36 views; .* at least ([\d.]+) m", left.reason)
+    assert 2.56 < float(found[1]) < 2 * 2.2 + 0.1
+    assert any("expected an image of at least" in reason for reason in result.quality.reasons)
+    warned = [text for level, text, _ in check_spectrum_sign(made.image, made.track) if level == WARNING]
+    assert len(warned) == 1
+    assert left.reason in warned[0]
+
+
+def test_dark_sediment_that_leads_out_of_the_image_is_no_body_whose_shadow_does():
+    bank = seabed_alone(Seabed(patches=(Patch((0.9, 0.0), (0.5, 1.0), 0.0, -12.0, 0.1),)))
+    result = run(bank.image, bank.track, COARSE)
+    assert (result.verdict, result.left_out) == ("no object", [])
 
 
 @pytest.mark.parametrize(("radius_m", "edge"), [(0.3, 0.05), (0.5, 0.2)])

@@ -98,6 +98,32 @@ def test_views_come_while_sectors_do_and_the_grid_is_that_of_the_whole_run(
     assert nodes["carver"].state_counts()["arc_deg"] == 360
 
 
+def test_sectors_on_lattices_of_their_own_give_the_grid_of_the_whole_run(
+    graph: Graph, simulated: SimulatedRun, tmp_path: Path
+) -> None:
+    made = list(sectors_of_run(simulated.image, simulated.track, SECTOR_DEG, "own"))
+    bag = write_run(
+        tmp_path / "own",
+        None,
+        simulated.track,
+        sectors=[sector for sector, _ in made],
+        sector_times_ns={sector.stamp_ns: when for sector, when in made},
+    )
+    assert len({sector.grid.shape for sector, _ in made}) > 3
+    there = read_run(bag)
+    spectrum = there.sector_sum().spectrum
+    reference = run(there.coherent_image(), there.require_track(), PARAMETERS, spectrum=spectrum)
+    nodes = streaming_graph(graph, bag, 200.0, **given(reference))
+    graph.spin_until(complete(nodes), 60.0)
+    assert nodes["sub_aperture"].state_counts()["sectors"] == 24
+    assert_same_grid(nodes["carver"], reference)
+    whole = run(simulated.image, simulated.track, PARAMETERS)
+    assert reference.dimensions is not None
+    assert whole.dimensions is not None
+    for name in ("length_m", "width_m", "height_m"):
+        assert abs(getattr(reference.dimensions, name) - getattr(whole.dimensions, name)) < VOXEL_M / 2
+
+
 def test_the_last_sectors_views_are_through_before_the_whole_circle_is_searched(
     graph: Graph, sector_bag: Path, reference_of_sectors: Result, monkeypatch: pytest.MonkeyPatch
 ) -> None:

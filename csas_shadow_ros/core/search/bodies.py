@@ -84,6 +84,19 @@ _PLAIN = 1.5
 #: The other sign must explain this many times more body than the stated one to be called the right one.
 _SIGN_RATIO = 4.0
 
+#: Why a body is none that is in view, but whose shadows are not.
+LEAVES = "its shadow leaves the image"
+#: A moving shadow that leaves the image takes at least this share of the scene in one view, and ends nearer
+#: to the far edge than this share of the scene's side, in more than this share of the views. Seabed alone has
+#: pieces of 0.4 to 1.2 % there, a patch at the edge 3 % in 13 of 36 views, cylinders of 0.7 sides 5 to 14 %
+#: in 25 and 29. Half the first and patches are shadows; double the last and nobody's are.
+_LEAVING_SHARE, _LEAVING_EDGE, _LEAVING_VIEWS = 0.03, 0.1, 0.5
+#: What is dark in more of the views than this is seabed that is dark itself: a body's shadow covers one place
+#: from less than half of the circle, but for its own plan.
+_STILL = 0.6
+#: Power of a shadow in a smoothed view, over the seabed's: 4 dB under it.
+_SHADOW_POWER = 0.4
+
 #: Why a body that is consistent only with the other sign is none, and no evidence for that sign either.
 HOLLOW = (
     "its shadow falls towards the sonar: a hollow in the seabed, or a bright body and the wrong"
@@ -229,6 +242,9 @@ def _search(looks: Sequence[_Look], camera: ShadowCamera, extent_m: float, *, tw
             judged.add(body, looks)
     if twice and not any(target.stands for target, _ in judged.found):
         _look_again(judged, looks, volume)
+    if twice and not any(target.stands for target, _ in judged.found):
+        leaving = _leaving(looks, (float(middle[0]), float(middle[1])), extent_m)
+        judged.left_out += [] if leaving is None else [leaving]
     # Sorting is stable: what is as evident stays in the order of its place.
     found = sorted(judged.found, key=lambda one: -one[0].evidence)
     targets, thrown = tuple(target for target, _ in found), tuple(thrown for _, thrown in found)
@@ -472,6 +488,54 @@ def _look_again(judged: _Judged, looks: Sequence[_Look], volume: Volume) -> None
         inside = first_j > 0 and first_i > 0 and last_j < power.shape[1] - 1 and last_i < power.shape[2] - 1
         if len(whole[0]) >= _MIN_VOXELS and inside:  # what leads out of the scene is its level, no body
             judged.add(_Body(volume, whole, seed.core), looks, faint=True)
+
+
+def _leaving(looks: Sequence[_Look], middle: tuple[float, float], extent_m: float) -> LeftOut | None:
+    """Return the body whose shadows leave the image, if most views show large ones that move and end there.
+
+    Such a body has no top that is dark from all sides, and so the search sees nothing of it.
+    """
+    d = extent_m / _SEARCH_VOXELS
+    side = math.ceil(1.5 * _SEARCH_VOXELS)  # a square scene reaches over it at its corners
+    at = (np.arange(side) - (side - 1) / 2.0) * d
+    x, y = (values.ravel() for values in np.meshgrid(at + middle[0], at + middle[1]))
+    dark, seen = np.zeros(side * side), np.zeros(side * side)
+    for look in looks:
+        powers, known = _powers_at(look.power, x, y)
+        seen += known
+        dark += known & (powers < _SHADOW_POWER)
+    moves = (dark <= _STILL * seen).reshape(side, side)
+    reaches, starts = [], []
+    for look in looks:
+        camera, pixels = look.power.info.camera, look.power.pixels
+        known = pixels != _UNKNOWN
+        labels, count = scipy.ndimage.label(known & (pixels < _SHADOW_POWER * _MEAN))
+        row, col = np.nonzero(labels)
+        if not count or not row.size:
+            continue
+        ground = camera.pixel_to_ground[:2] @ np.stack([col, row, np.ones_like(row)])
+        i, j = (np.rint((g - m) / d + (side - 1) / 2.0) for g, m in zip(ground, middle, strict=True))
+        i, j = (np.clip(n, 0, side - 1).astype(np.intp) for n in (i, j))
+        sizes = np.bincount(labels[row, col][moves[j, i]], minlength=count + 1)
+        largest = int(sizes.argmax())
+        mine = labels[row, col] == largest
+        row_m, col_m = camera.spacing_m
+        far = camera.rows - 1 - np.argmax(known[::-1], axis=0)
+        left = float((far[col[mine]] - row[mine]).min()) * row_m
+        if sizes[largest] * row_m * col_m > _LEAVING_SHARE * extent_m**2 and left < _LEAVING_EDGE * extent_m:
+            ground = ground[:, mine]
+            reaches.append(float(np.hypot(ground[0] - middle[0], ground[1] - middle[1]).max()))
+            starts.append(ground[:, int(row[mine].argmin())])
+    if len(reaches) <= _LEAVING_VIEWS * len(looks):
+        return None
+    # Its shadows begin round the body itself, on the side of each view's sonar.
+    place = np.mean(starts, axis=0)
+    return LeftOut(
+        (float(place[0]), float(place[1])),
+        f"{LEAVES} in {len(reaches)} of {len(looks)} views; expected an image of at least"
+        f" {2.0 * max(reaches):.1f} m",
+        strong=True,
+    )
 
 
 def _searching(image: CoherentImage, track: Track, spectrum: Spectrum) -> SubApertures:
