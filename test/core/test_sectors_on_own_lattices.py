@@ -235,3 +235,15 @@ def test_a_projection_that_is_turned_reads_back_and_one_that_is_no_map_is_refuse
         ground_from_projection(tilted, *lattice.shape)
     with pytest.raises(GeometryError, match="expected two directions"):
         GroundLattice(4, 4, (0.0, 0.0), (0.1, 0.0), (0.2, 0.0))
+
+
+@pytest.mark.parametrize("size_m", [200.0, 1e5, 1e9])
+def test_a_small_sector_that_tells_of_a_huge_scene_is_refused_at_once(size_m):
+    lattice = GroundLattice(60, 70, (0.0, 0.0), (size_m / 70, 0.0), (0.0, -size_m / 60))
+    # A band so narrow that those pixels hold it.
+    narrow = replace(acoustics(), bandwidth_hz=1e-9)
+    aspect, arc = 0.0, 1e-12
+    carrier = (narrow.ground_band(nominal_grazing())[1], 0.0)
+    blank = np.zeros(lattice.shape, np.complex64)
+    with pytest.raises(GeometryError, match=r"^sector at 5 ns: it covers .* pixels; expected at most"):
+        SectorSum().add(Sector(blank, lattice, narrow, 5, aspect, arc, carrier))

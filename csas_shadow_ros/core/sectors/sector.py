@@ -21,6 +21,9 @@ _EDGE_PIXELS = 0.5 + 1e-6
 #: A lattice holds the scene's band if its Nyquist wavenumber reaches this fraction of the band's edge, which
 #: the carrier tells, rounded to a bin of the spectrum.
 _WHOLE_BAND = 0.98
+#: A scene that a few small sectors tell of has at most so many pixels (2 GiB): 16384², the largest profile. A
+#: wrong P or band must not ask for all memory.
+MAX_SCENE_PIXELS = 1 << 28
 #: So far may a band reach beyond a lattice's Nyquist wavenumber (fraction of it), told by the track's mean
 #: grazing angle: the angle at the sector's own aspect is another by some degrees where the track wobbles.
 _FOLD_SLACK = 0.05
@@ -247,6 +250,12 @@ def scene_of(first: HasBand) -> GroundGrid:
         raise GeometryError(fault)
     left, right, bottom, top = GroundLattice.of(grid).extent_m
     width, height = right - left, top - bottom
+    across, down = width * high / math.pi, height * high / math.pi
+    if not (across * down <= MAX_SCENE_PIXELS and max(across, down) < 1 << 16):
+        raise GeometryError(
+            f"it covers {width:.4g} by {height:.4g} m, whose image at this band would have {across:.3g} by"
+            f" {down:.3g} pixels; expected at most {MAX_SCENE_PIXELS:.3g} in all"
+        )
     least = math.ceil(width * high / math.pi)
     # Late: it needs the FFT, which readers of messages need not load.
     from scipy.fft import next_fast_len
