@@ -290,8 +290,8 @@ def odd_sectors(infos: Iterable[SectorInfo]) -> dict[int, str]:
     return sectors_of_one_run(infos)[0]
 
 
-def sectors_of_one_run(infos: Iterable[SectorInfo]) -> tuple[dict[int, str], GroundGrid | None]:
-    """Return what is wrong with the odd ones, by stamp, and the lattice that the rest add up on."""
+def _kinds_of(infos: Iterable[SectorInfo]) -> list[list[SectorInfo]]:
+    """Return the sectors that are alike, together."""
     kinds: list[list[SectorInfo]] = []
     for info in infos:
         for kind in kinds:
@@ -300,6 +300,12 @@ def sectors_of_one_run(infos: Iterable[SectorInfo]) -> tuple[dict[int, str], Gro
                 break
         else:
             kinds.append([info])
+    return kinds
+
+
+def sectors_of_one_run(infos: Iterable[SectorInfo]) -> tuple[dict[int, str], GroundGrid | None]:
+    """Return what is wrong with the odd ones, by stamp, and the lattice that the rest add up on."""
+    kinds = _kinds_of(infos)
     if not kinds:
         return {}, None
     most = max(kinds, key=len)
@@ -418,6 +424,12 @@ def _one_image(run: Run, reader: BagReader, runs: BagRuns) -> CoherentImage | No
     return image
 
 
+def _quantised(sectors: list[Sector], encoding: str) -> list[Sector]:
+    """Round all sectors by one scale, so that they still sum."""
+    peak = max((largest_part(s.pixels) for s in sectors), default=0.0)
+    return [replace(s, pixels=quantise(s.pixels, encoding, peak)) for s in sectors]
+
+
 def write_run(
     path: str | Path,
     image: CoherentImage | None,
@@ -509,9 +521,7 @@ def write_run(
             writer.add_topic(name("origin"), TOPICS["origin"].type_name, depth=1)
             writer.write(name("origin"), origin_to_msg(factory, Origin(first_ns, frame, datum)), when)
         if integers:
-            sectors = list(sectors)
-            peak = max((largest_part(s.pixels) for s in sectors), default=0.0)
-            sectors = [replace(s, pixels=quantise(s.pixels, encoding, peak)) for s in sectors]
+            sectors = _quantised(list(sectors), encoding)
         for sector in sectors:
             a, b = sector_to_msgs(factory, sector, encoding)
             made = (sector_times_ns or {}).get(sector.stamp_ns)

@@ -1,5 +1,3 @@
-# What is asked of the page is JavaScript, and stays in one piece.
-# ruff: noqa: E501
 """The page of an archive: rows, map, thumbnails, and a click that opens the run."""
 
 from __future__ import annotations

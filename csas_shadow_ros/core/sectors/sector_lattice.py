@@ -15,7 +15,7 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.special import i0
 
-from .geometry import TWO_PI, GroundGrid, GroundLattice
+from ..geometry import TWO_PI, GroundGrid, GroundLattice
 from .sector import Sector, wave_on
 
 #: A lattice spans the scene's period if it is so near it (its own pixels).
@@ -35,7 +35,7 @@ def coefficients(
     Parameters
     ----------
     sector : Sector
-        On any lattice that is fit for the scene (`core.sector.unfit`).
+        On any lattice that is fit for the scene (`core.sectors.sector.unfit`).
     scene : GroundGrid
         The scene's lattice; the bins are those of its own period.
     workers : int
