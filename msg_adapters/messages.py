@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csas_shadow_ros.core.errors import AdapterError
-from csas_shadow_ros.core.geometry.frame_name import SCENE_FRAME as SCENE_FRAME
+from csas_shadow_ros.core.frame_name import SCENE_FRAME as SCENE_FRAME
 
 NANOSECONDS = 1_000_000_000
 #: ``builtin_interfaces/Time.sec`` is an int32.

@@ -520,8 +520,7 @@ def write_run(
             first_ns = int(track.stamps_ns[0]) if track is not None else when
             writer.add_topic(name("origin"), TOPICS["origin"].type_name, depth=1)
             writer.write(name("origin"), origin_to_msg(factory, Origin(first_ns, frame, datum)), when)
-        if integers:
-            sectors = _quantised(list(sectors), encoding)
+        sectors = _quantised(list(sectors), encoding) if integers else sectors
         for sector in sectors:
             a, b = sector_to_msgs(factory, sector, encoding)
             made = (sector_times_ns or {}).get(sector.stamp_ns)

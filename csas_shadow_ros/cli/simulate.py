@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from ..core.geometry.frame_name import SCENE_FRAME
+from ..core.frame_name import SCENE_FRAME
 from ..core.parameters import PlaceParameters
 from .console import OK, Console
 from .options import output_options

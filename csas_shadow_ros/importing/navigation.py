@@ -19,8 +19,8 @@ from msg_adapters.messages import NANOSECONDS, stamp_to_ns
 
 from ..bags import BagReader
 from ..core.errors import CsasError
+from ..core.frame_name import SCENE_FRAME
 from ..core.geometry import Datum, Track
-from ..core.geometry.frame_name import SCENE_FRAME
 from .settings import AXES, ImportSettingsError, Settings
 
 FloatArray = NDArray[np.float64]

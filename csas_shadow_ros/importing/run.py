@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..bags import write_run
+from ..core.frame_name import SCENE_FRAME
 from ..core.geometry import Acoustics, CoherentImage, Datum, GroundGrid
-from ..core.geometry.frame_name import SCENE_FRAME
 from .images import FoundImage, read_image
 from .navigation import read_track
 from .settings import ImportSettingsError, Settings, read_settings

@@ -98,6 +98,7 @@ def test_a_row_survives_json(accuracy):
     assert accuracy.Row.from_json(json.loads(json.dumps(row.to_json(timed=True)))) == row
 
 
+@pytest.mark.long
 def test_two_processes_write_the_same_files_as_one(accuracy, tmp_path):
     arguments = [*QUICK, "--targets", "box", "--seeds", "1", "--conditions", "clean", "phase"]
     one, two = tmp_path / "one" / "page.md", tmp_path / "two" / "page.md"

@@ -17,7 +17,13 @@ BY_HAND = {"box": 0.68, "cone": 0.70, "cylinder": 0.73, "sphere": 0.68, "tyre": 
 CONSENSUS = 0.78
 
 
-@pytest.mark.parametrize("target", BY_HAND)
+#: More of the same.
+_LONG = ("cylinder", "sphere", "tyre")
+
+
+@pytest.mark.parametrize(
+    "target", [pytest.param(t, marks=[pytest.mark.long] if t in _LONG else []) for t in BY_HAND]
+)
 def test_every_method_reaches_its_bound_on_a_standard_run(accuracy, target):
     settings = accuracy.Settings("standard", STEP_DEG, (accuracy.WITH_FFSE,))
     row = accuracy.score_case(accuracy.Case(target, 1), settings)

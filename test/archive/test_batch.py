@@ -101,6 +101,7 @@ def start(season: Path, archive: Path) -> subprocess.Popen:
     )
 
 
+@pytest.mark.long
 def test_a_killed_worker_and_a_killed_batch_cost_only_what_was_in_flight(season, tmp_path):
     archive = tmp_path / "archive"
     batch = start(season, archive)

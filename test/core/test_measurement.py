@@ -335,6 +335,7 @@ def test_views_that_agree_by_chance_tell_no_height_where_sides_are_not_straight(
     assert upright_height(untold, measured, [cap.begins_m], 0.012, VOLUME.voxel_size_m) is None
 
 
+@pytest.mark.long
 def test_shadow_lengths_behind_walls_that_are_not_upright_do_not_tell_the_height():
     occupied = hull_of(hidden_by_cone, INFOS, VOLUME)
     grid = grid_of(occupied)

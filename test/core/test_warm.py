@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 STAGES = {
-    "composites": ("warm_composites()", "composites"),
-    "enhancement": ("warm_enhancement()", "shadow"),
-    "likelihood": ("warm_likelihood()", "segmentation"),
-    "carving": ("warm_carving()", "carving"),
-    "soft carving": ("warm_carving(CarvingParameters(method='soft'))", "carving"),
-    "sub-apertures": ("warm_sub_apertures()", "streaming"),
+    "composites": ("warm_composites()", "imaging.composites"),
+    "enhancement": ("warm_enhancement()", "imaging.enhancement"),
+    "likelihood": ("warm_likelihood()", "imaging.segmentation"),
+    "carving": ("warm_carving()", "shape.carving"),
+    "soft carving": ("warm_carving(CarvingParameters(method='soft'))", "shape.carving"),
+    "sub-apertures": ("warm_sub_apertures()", "sectors.streaming"),
 }
 
 

@@ -9,12 +9,12 @@ downwards. See ``docs/conventions.md``.
 
 from __future__ import annotations
 
+from ..frame_name import SCENE_FRAME
 from .camera import (
     ShadowCamera,
     shadow_matrix,
     view_ground_to_pixel,
 )
-from .frame_name import SCENE_FRAME
 from .frames import (
     TWO_PI,
     Acoustics,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import GeometryError, TrackError, check_range
-from .frame_name import SCENE_FRAME
+from ..frame_name import SCENE_FRAME
 from .frames import FloatArray, one_frame, wrap_angle
 from .track import Track
 

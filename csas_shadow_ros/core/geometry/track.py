@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import TrackError, check_range
-from .frame_name import SCENE_FRAME
+from ..frame_name import SCENE_FRAME
 from .frames import TWO_PI, FloatArray, wrap_angle
 
 

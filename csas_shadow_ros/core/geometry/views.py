@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import GeometryError
+from ..frame_name import SCENE_FRAME
 from .camera import ShadowCamera
-from .frame_name import SCENE_FRAME
 from .frames import TWO_PI, Acoustics, FloatArray, GroundGrid, down_range_axis
 
 
