@@ -151,7 +151,8 @@ def no_index(stderr: str, folder: Path) -> bool:
     return bool(subprocess.run(probe, capture_output=True, check=False).returncode)
 
 
-@pytest.mark.parametrize("python", [pytest.param(PYTHONS[0], marks=pytest.mark.long), PYTHONS[-1]])  # half a minute each
+# Half a minute each.
+@pytest.mark.parametrize("python", [pytest.param(PYTHONS[0], marks=pytest.mark.long), PYTHONS[-1]])
 def test_every_core_dependency_has_a_wheel_for_arm64(python: str, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--quiet"]
     command += ["--disable-pip-version-check", "--only-binary=:all:", "--target", str(tmp_path)]
