@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from csas_shadow_ros.core import reference
 from csas_shadow_ros.core.errors import GeometryError, ParameterError
 from csas_shadow_ros.core.geometry import GroundGrid, GroundLattice, ground_from_projection
-from csas_shadow_ros.core.sector import Sector, scene_of, unfit
-from csas_shadow_ros.core.streaming import SectorSum
+from csas_shadow_ros.core.sectors.sector import Sector, scene_of, unfit
+from csas_shadow_ros.core.sectors.streaming import SectorSum
 from csas_shadow_ros.simulation.sectors import sectors_of_run
 
 ARC = math.radians(20.0)

@@ -27,6 +27,8 @@ from csas_shadow_ros.bags import read_run, write_run
 from csas_shadow_ros.core.errors import BagError, NoTargetError, ParameterError, SpectrumSignError
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.pipeline import ProcessedView, Result, run
+from csas_shadow_ros.graph import processes as graph_module
+from csas_shadow_ros.graph import replay as module
 from csas_shadow_ros.graph.processes import (
     DomainReservation,
     Graph,
@@ -35,8 +37,6 @@ from csas_shadow_ros.graph.processes import (
     graph_environment,
     start_fork_server,
 )
-from csas_shadow_ros.graph.processes import processes as graph_module
-from csas_shadow_ros.graph.processes import replay as module
 from csas_shadow_ros.graph.replay import replay
 from csas_shadow_ros.nodes.runtime.shared_memory import segments_of
 from csas_shadow_ros.simulation import SimulatedRun
@@ -304,7 +304,7 @@ def test_nodes_end_when_the_process_that_started_them_was_killed(tmp_path: Path,
         "g.__enter__(); print(g.processes['composites'].pid, server and server.pid, flush=True)\n"
         "time.sleep(600)"
     )
-    environment = {**os.environ, "PYTHONPATH": str(Path(module.__file__).parents[1])}
+    environment = {**os.environ, "PYTHONPATH": str(Path(module.__file__).parents[2])}
     command = [sys.executable, "-c", code]
     parent = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     assert parent.stdout is not None
@@ -477,7 +477,7 @@ def test_an_interrupt_while_processes_are_ended_leaves_none(
 
 def test_a_terminated_replay_leaves_no_process_and_no_shared_memory(run_bag: Path, tmp_path: Path) -> None:
     before = segments()
-    environment = {**os.environ, "PYTHONPATH": str(Path(module.__file__).parents[1])}
+    environment = {**os.environ, "PYTHONPATH": str(Path(module.__file__).parents[2])}
     out = str(tmp_path / "out")
     command = [sys.executable, "-m", "csas_shadow_ros.cli", "replay", str(run_bag), "--out", out]
     cli = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -498,7 +498,7 @@ def test_a_terminated_replay_leaves_no_process_and_no_shared_memory(run_bag: Pat
 def test_a_replay_that_is_killed_with_a_node_of_its_graph_leaves_no_process_and_no_shared_memory(
     run_bag: Path, tmp_path: Path
 ) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(Path(module.__file__).parents[1])}
+    environment = {**os.environ, "PYTHONPATH": str(Path(module.__file__).parents[2])}
     command = [sys.executable, "-m", "csas_shadow_ros.cli", "replay", str(run_bag), "--out"]
     cli = subprocess.Popen(
         [*command, str(tmp_path / "out")],

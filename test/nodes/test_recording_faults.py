@@ -21,7 +21,7 @@ from graph_of_nodes import PARAMETERS, Graph
 from csas_shadow_ros.bags import BagReader, BagWriter, read_run
 from csas_shadow_ros.bags.bag import copy
 from csas_shadow_ros.core.pipeline import ProcessedView, Result
-from csas_shadow_ros.graph.processes import replay as module
+from csas_shadow_ros.graph import replay as module
 from csas_shadow_ros.graph.replay import replay
 from csas_shadow_ros.nodes.bag_player import BagPlayerNode
 from csas_shadow_ros.nodes.bag_recorder import BagRecorderNode

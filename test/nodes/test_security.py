@@ -16,8 +16,8 @@ pytest.importorskip("rclpy")
 from graph_of_nodes import PARAMETERS, Graph
 
 import csas_shadow_ros
-from csas_shadow_ros.nodes.params import NODES
-from csas_shadow_ros.replay import replay
+from csas_shadow_ros.graph.replay import replay
+from csas_shadow_ros.nodes.runtime.params import NODES
 from csas_shadow_ros.security import ros_services, ros_topics
 
 ROOT = Path(csas_shadow_ros.__file__).resolve().parents[1]

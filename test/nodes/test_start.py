@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # A library that swallows KeyboardInterrupt while it is imported, as trimesh does.
 INTERRUPTED_IMPORT = """
 import importlib, os, signal, sys, types
-from csas_shadow_ros.nodes import start
+from csas_shadow_ros.nodes.runtime import start
 
 def swallow(name):
     try:

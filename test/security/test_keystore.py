@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives import serialization
 
 from csas_shadow_ros.cli import main
 from csas_shadow_ros.core.errors import ParameterError
-from csas_shadow_ros.nodes.params import NODES as REAL_NODES
+from csas_shadow_ros.nodes.runtime.params import NODES as REAL_NODES
 from csas_shadow_ros.security import (
     NODES,
     REACH,

@@ -12,7 +12,7 @@ import scipy.fft
 from csas_shadow_ros.bags import read_run
 from csas_shadow_ros.cli import main
 from csas_shadow_ros.core.errors import ParameterError
-from csas_shadow_ros.core.streaming import SectorSum
+from csas_shadow_ros.core.sectors.streaming import SectorSum
 from csas_shadow_ros.nodes.playing import BagViews
 from csas_shadow_ros.simulation import Faults, simulate, simulate_bag
 from csas_shadow_ros.simulation.sectors import sectors_of_run
