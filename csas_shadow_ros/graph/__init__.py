@@ -1,5 +1,5 @@
 """The node graph: its processes, and the replay of a bag through them."""
 
-from .processes import Graph, start_fork_server
+from .processes import DomainReservation, Graph, GraphProcess, graph_environment, start_fork_server
 
-__all__ = ["Graph", "start_fork_server"]
+__all__ = ["DomainReservation", "Graph", "GraphProcess", "graph_environment", "start_fork_server"]
