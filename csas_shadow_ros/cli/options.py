@@ -7,7 +7,7 @@ import dataclasses
 import math
 from typing import Any
 
-from ..core.parameters import STAGES, PipelineParameters
+from ..core.parameters import STAGES, START_FROM, PipelineParameters
 
 ALL_RUNS = "all"
 
@@ -83,6 +83,22 @@ def parameters_of(arguments: argparse.Namespace) -> PipelineParameters:
     from ..public import parameters
 
     return parameters(arguments.params, **given_parameters(arguments))
+
+
+def bag_argument(p: argparse.ArgumentParser) -> None:
+    """Add the bag, and the namespace of its topics."""
+    p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
+    p.add_argument("--namespace", help="namespace of its topics (found by itself)")
+
+
+def start_option(p: argparse.ArgumentParser) -> None:
+    """Add ``--start-from``."""
+    p.add_argument(
+        "--start-from",
+        choices=START_FROM,
+        default="auto",
+        help="image (or sectors) and track, or views of a stage; auto: the first that the bag holds",
+    )
 
 
 def run_option(parser: argparse.ArgumentParser, *, each: bool = False) -> None:

@@ -10,10 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ..core.parameters import START_FROM
 from .console import FAILED, PROGRAM, Console
 from .each_run import each_run, give_report
 from .options import (
+    bag_argument,
     expect_options,
     objects_option,
     output_options,
@@ -21,6 +21,7 @@ from .options import (
     parameters_of,
     results_options,
     run_option,
+    start_option,
 )
 
 
@@ -37,14 +38,8 @@ def add_replay(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _replay_options(p: argparse.ArgumentParser) -> None:
-    p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
-    p.add_argument("--namespace", help="namespace of its topics (found by itself)")
-    p.add_argument(
-        "--start-from",
-        choices=START_FROM,
-        default="auto",
-        help="image (or sectors) and track, or views of a stage; auto: the first that the bag holds",
-    )
+    bag_argument(p)
+    start_option(p)
     p.add_argument(
         "--rate",
         type=float,

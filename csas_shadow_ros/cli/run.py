@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import ParameterError
-from ..core.parameters import START_FROM
 from .console import Console
 from .each_run import each_run, give_report
 from .options import (
+    bag_argument,
     expect_options,
     objects_option,
     output_options,
@@ -19,6 +19,7 @@ from .options import (
     parameters_of,
     results_options,
     run_option,
+    start_option,
 )
 
 
@@ -42,15 +43,9 @@ def add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _run_options(p: argparse.ArgumentParser) -> None:
-    p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
-    p.add_argument("--namespace", help="namespace of its topics (found by itself)")
+    bag_argument(p)
     run_option(p, each=True)
-    p.add_argument(
-        "--start-from",
-        choices=START_FROM,
-        default="auto",
-        help="image (or sectors) and track, or views of a stage; auto: the first that the bag holds",
-    )
+    start_option(p)
     p.add_argument(
         "--spectrum-sign",
         type=int,

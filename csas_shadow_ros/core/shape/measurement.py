@@ -86,7 +86,7 @@ _FOREIGN_CELLS = 3.0
 _MIN_EDGES = 24
 #: Sides that scatter about the fitted plan by more than this (cross-range cells, 1σ) are not those of one
 #: plan: edges are found to a fraction of a cell. Simulated targets scatter by 0.19 to 0.57, the chips of a
-#: measured vehicle, which were cut out one by one (docs/examples.md), by 1.7.
+#: measured vehicle, which were cut out one by one (docs/examples.md), by 1.5.
 _ONE_PLAN_CELLS = 1.0
 #: Parts of a plan that are thinner than this are not measured where the sides scatter so (cross-range cells).
 #: The measured vehicle of docs/examples.md is 7.77 m long with its crumbs and 6.99 m without (its hull has

@@ -28,7 +28,7 @@ _UNEXPLAINED, _MOST_UNEXPLAINED = 0.1, 0.25
 #: The limits are reasoned, not measured.
 _LIT, _MOST_LIT = 0.05, 0.15
 #: Sides that scatter about one plan by more than this (1σ, cross-range cells) disagree from view to view:
-#: right shapes 0.2 to 0.6, a vehicle whose views are shifted against each other 1.7 (docs/examples.md).
+#: right shapes 0.2 to 0.6, a vehicle whose views are shifted against each other 1.5 (docs/examples.md).
 _SCATTER_CELLS = 1.0
 #: Shadows that leave the image in more than this share of the views: heights are then told by the fewer views
 #: that see a tip. Those alone bound the top, so that a quarter of the circle without tips changes no height
