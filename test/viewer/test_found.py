@@ -173,9 +173,10 @@ def test_a_link_brings_rulers_and_the_camera_back(watched, serve, run_store):
 def cursor(watched: Any) -> tuple[float, float]:
     """Where the green cursor is on the circle: degrees on the screen, counter-clockwise from the right."""
     return watched.js(
-        """(() => { const s = csas.panels[1].slider, c = s.ring, d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let x = 0, y = 0, n = 0;
-        for (let i = 0; i < d.length; i += 4) if (d[i] === 41 && d[i + 1] === 216 && d[i + 2] === 90) { x += (i / 4) % c.width; y += Math.floor(i / 4 / c.width); n++; }
-        return Math.atan2(c.height / 2 - y / n, x / n - c.width / 2) * 180 / Math.PI; })()"""
+        """(() => { const s = csas.panels[1].slider, c = s.ring.getBoundingClientRect(), d = s.dot.getBoundingClientRect();
+        const x = (d.left + d.right - c.left - c.right) / 2, y = (c.top + c.bottom - d.top - d.bottom) / 2;
+        if (d.width < 10 || Math.abs(Math.hypot(x, y) - s.radius) > 1) throw new Error(`no cursor on the circle: ${d.width} px, ${Math.hypot(x, y)} off`);
+        return Math.atan2(y, x) * 180 / Math.PI; })()"""
     )
 
 

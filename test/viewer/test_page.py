@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from synthetic import COUNT, code_of, entry
+from synthetic import COUNT, PIXELS, code_of, entry
 
 from csas_shadow_ros.cli import main
+from csas_shadow_ros.core.imaging.masks import MASK_SHADOW
 from csas_shadow_ros.core.shape.mesh import mesh_from_grid
 from csas_shadow_ros.viewer.export import export_html
 from csas_shadow_ros.viewer.server import ViewerServer
-from csas_shadow_ros.viewer.store import ViewStore
+from csas_shadow_ros.viewer.store import Entry, ViewStore
 
 #: Where screenshots go: the README's are made by this run (CSAS_SCREENSHOTS=docs/figures).
 SCREENSHOTS = os.environ.get("CSAS_SCREENSHOTS", "")
@@ -412,6 +413,48 @@ def test_every_key_of_the_help_does_what_it_says(watched, serve, run_store):
     press("ArrowRight")
     assert js("+document.activeElement.value") > threshold
     watched.until(f"csas.stats.surfaces.length > {surfaces}")
+
+
+def store_of_shadows() -> ViewStore:
+    """Grey views, each with a square shadow of 1 m."""
+    store = store_of()
+    mask = np.zeros((PIXELS, PIXELS), np.uint8)
+    mask[38:58, 38:58] = MASK_SHADOW
+    for i in range(COUNT):
+        store.put_view("shadow_mask", Entry(entry(i).info, "1", lambda: mask))
+    return store
+
+
+def test_outlines_are_there_before_their_views_are_gone_to_and_lie_on_the_shadows_edge(watched, serve):
+    watched.open(serve(store_of_shadows()))
+    watched.until(f"csas.loader.outlines.size === {COUNT}")
+    for aspect in (0, 40, 200):
+        watched.js(f"csas.setAspect({aspect})")
+        watched.settle()
+        # How far pixels of the outline's colour are from the square's edge, in the view's pixels.
+        off = watched.js(
+            """(() => { const p = csas.panels[1], c = p.slider.picture, d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data, A = csas.current.A, out = [];
+            const T = p.ground(csas.current), det = T[0] * T[3] - T[1] * T[2];
+            for (let i = 0; i < d.length; i += 4) if (d[i] - d[i + 2] > 150) {
+              const h = (i / 4) % c.width + 0.5 - T[4], v = Math.floor(i / 4 / c.width) + 0.5 - T[5], x = (T[3] * h - T[2] * v) / det, y = (T[0] * v - T[1] * h) / det;
+              const u = A[0] * x + A[1] * y + A[2], w = A[3] * x + A[4] * y + A[5];
+              out.push(Math.max(Math.abs(u - 47.5), Math.abs(w - 47.5)));
+            } return out; })()"""
+        )
+        assert len(off) > 200
+        assert np.median(off) == pytest.approx(9.5, abs=0.3)
+        assert np.ptp(off) < 1.5
+
+
+def test_the_cursor_is_on_paper_too(watched, serve):
+    watched.open(serve(store_of()))
+    watched.settle()
+    green = "(() => { const c = csas.panels[1].slider.ring, d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let n = 0; for (let i = 0; i < d.length; i += 4) if (d[i] === 41 && d[i + 1] === 216 && d[i + 2] === 90) n++; return n; })()"
+    assert watched.js(green) == 0, "what moves is no part of the circle on the screen"
+    watched.js("dispatchEvent(new Event('beforeprint'))")
+    assert watched.js(green) > 100
+    watched.js("dispatchEvent(new Event('afterprint'))")
+    assert watched.js(green) == 0
 
 
 def test_after_a_click_on_a_box_or_a_button_the_keys_still_work(watched, serve):

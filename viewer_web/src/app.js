@@ -298,7 +298,9 @@ class App {
     const lists = this.panels.filter((p) => p.isView).map((p) => this.views(p.layer).map((v) => this.address(p.layer, v, "jpg")));
     const order = lists.map(coarseToFine), mixed = [];
     for (let i = 0; i < Math.max(0, ...order.map((l) => l.length)); i++) for (const l of order) if (l[i]) mixed.push(l[i]);
-    this.loader.fetchAll([...new Set(mixed)]);
+    // Outlines come last: few bytes, and a picture may be seen without.
+    const runs = ["", "b."].flatMap((run) => coarseToFine(this.views(`${run}shadow_mask`)).map((mask) => this.contourAddress(run, mask)));
+    this.loader.fetchAll([...new Set([...mixed, ...runs])]);
   }
 
   prefetch() {
@@ -819,7 +821,7 @@ class App {
     g.drawImage(one, 0, 0);
     if (!p.six) {
       const ring = new OffscreenCanvas(px, px);
-      slider.paintRing(ring.getContext("2d"), px, k);
+      slider.paintRing(ring.getContext("2d"), px, k, true);
       g.drawImage(ring, 0, 0);
     }
     g.fillStyle = "#c9d3d9"; g.font = `${Math.round(px / 58)}px sans-serif`;

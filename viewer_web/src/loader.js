@@ -2,6 +2,7 @@
 const DECODED = 24, DECODES = 2, FETCHES = 4;
 
 const COLOURS = /\/(likelihood|color_by_aspect)\//;
+const isOutline = (address) => address.startsWith("api/contour/");
 
 export class Loader {
   constructor(files, startWorker, changed) {
@@ -14,9 +15,10 @@ export class Loader {
     this.bitmaps = new Map(); // address → { width, height, codes } or ImageBitmap (colours), least recently used first
     this.busy = new Map(); // address → "fetch" | "decode"
     this.failed = new Map(); // address → when
+    this.awaited = new Set(); // outlines that a picture was drawn without
     this.wanted = []; // addresses to decode, the most wanted first
     this.all = []; // addresses to fetch sometime, coarse to fine
-    this.json = new Map();
+    this.outlines = new Map(); // address → closed lines
   }
 
   async get(address) {
@@ -53,6 +55,7 @@ export class Loader {
     this.all = addresses;
     const kept = new Set(addresses);
     for (const a of this.blobs.keys()) if (!kept.has(a) && !a.endsWith(".png")) this.blobs.delete(a);
+    for (const a of this.outlines.keys()) if (!kept.has(a)) this.outlines.delete(a);
     this.pump();
   }
 
@@ -67,7 +70,7 @@ export class Loader {
     }
     while (!this.paused && this.all.length && this.running("fetch") < FETCHES - 1) {
       const a = this.all.shift();
-      if (!this.blobs.has(a) && !this.busy.has(a)) this.fetch(a);
+      if (!this.blobs.has(a) && !this.outlines.has(a) && !this.busy.has(a)) this.fetch(a);
     }
   }
 
@@ -76,7 +79,10 @@ export class Loader {
     this.busy.set(a, "fetch");
     try {
       const blob = await this.get(a);
-      this.blobs.set(a, blob);
+      if (isOutline(a)) {
+        this.outlines.set(a, JSON.parse(await blob.text()));
+        if (this.awaited.delete(a)) this.changed();
+      } else this.blobs.set(a, blob);
       if (a.endsWith(".png")) {
         // Exact pictures are large: a few are kept.
         const exact = [...this.blobs.keys()].filter((k) => k.endsWith(".png"));
@@ -121,14 +127,13 @@ export class Loader {
     this.pump();
   }
 
-  lines(address) {
-    if (!this.json.has(address)) {
-      this.json.set(address, null);
-      this.get(address)
-        .then(async (blob) => { this.json.set(address, JSON.parse(await blob.text())); this.changed(); })
-        .catch(() => setTimeout(() => this.json.delete(address), 2000));
+  // A mask's outlines; undefined until they are there.
+  lines(a) {
+    if (!this.outlines.has(a)) {
+      this.awaited.add(a);
+      if (!this.busy.has(a) && !this.paused) this.fetch(a);
     }
-    return this.json.get(address);
+    return this.outlines.get(a);
   }
 }
 

@@ -36,6 +36,44 @@ function within(start, step, end) {
   return [Math.ceil(Math.min(one, other)), Math.floor(Math.max(one, other))];
 }
 
+// CSS pixels.
+const OUTLINE_PX = 1.6;
+const [OUTLINE_R, OUTLINE_G, OUTLINE_B] = [1, 3, 5].map((i) => parseInt(COLOURS.outline.slice(i, i + 2), 16));
+
+// A closed line into pixels, before they go to the canvas: its own strokes take several times as long, and
+// cost a seventh of the views that are drawn in a second. M: the line's pixels → the canvas's.
+function trace(out, side, radius, line, [a, b, c, d, e, f], width) {
+  const reach = width / 2 + 0.5, n = line.length, half = side / 2;
+  let px = a * line[n - 2] + b * line[n - 1] + c, py = d * line[n - 2] + e * line[n - 1] + f;
+  for (let i = 0; i < n; i += 2) {
+    const x = a * line[i] + b * line[i + 1] + c, y = d * line[i] + e * line[i + 1] + f;
+    const dx = x - px, dy = y - py, square = dx * dx + dy * dy || 1, flat = Math.abs(dx) >= Math.abs(dy);
+    const mx = (x + px) / 2 - half, my = (y + py) / 2 - half, most = radius + reach + Math.sqrt(square) / 2;
+    if (mx * mx + my * my > most * most) { // nothing of it is on the disc
+      px = x;
+      py = y;
+      continue;
+    }
+    // Along the longer of its sides, and as far to both of the other as the line is wide.
+    const p = flat ? px : py, q = flat ? py : px, along = flat ? dx : dy, across = flat ? dy : dx, slope = along ? across / along : 0;
+    const off = reach * Math.sqrt(1 + slope * slope), low = Math.min(q, q + across), high = Math.max(q, q + across);
+    const last = Math.min(side - 1, Math.floor(Math.max(p, p + along) + reach));
+    for (let s = Math.max(0, Math.floor(Math.min(p, p + along) - reach)); s <= last; s++) {
+      const middle = Math.min(high, Math.max(low, q + (s + 0.5 - p) * slope)), end = Math.min(side - 1, Math.floor(middle + off));
+      for (let t = Math.max(0, Math.floor(middle - off)); t <= end; t++) {
+        const h = flat ? s : t, v = flat ? t : s, fx = h + 0.5 - px, fy = v + 0.5 - py;
+        const share = Math.min(1, Math.max(0, (fx * dx + fy * dy) / square)), ex = fx - share * dx, ey = fy - share * dy;
+        const cover = Math.min(256, (256 * (reach - Math.sqrt(ex * ex + ey * ey))) | 0);
+        if (cover <= 0) continue;
+        const at = v * side + h, old = out[at], red = old & 255, green = (old >> 8) & 255, blue = (old >> 16) & 255;
+        out[at] = 0xff000000 | (red + (((OUTLINE_R - red) * cover) >> 8)) | ((green + (((OUTLINE_G - green) * cover) >> 8)) << 8) | ((blue + (((OUTLINE_B - blue) * cover) >> 8)) << 16);
+      }
+    }
+    px = x;
+    py = y;
+  }
+}
+
 export class Panel {
   constructor(place, app, layer, label) {
     this.app = app;
@@ -212,7 +250,8 @@ export class Panel {
       );
     };
     const moved = [T[0], T[1], T[2], T[3], T[4] + T[0] * other[0] + T[2] * other[1], T[5] + T[1] * other[0] + T[3] * other[1]];
-    if (bitmap?.codes) this.levels(g, bitmap, product(about.A, inverse(swapped(moved))), frame.radius);
+    const outline = view && app.state.contour && bitmap && this.outline(view, isOther(this.layer) ? "b." : "");
+    if (bitmap?.codes) this.levels(g, bitmap, product(about.A, inverse(swapped(moved))), frame, outline && { ...outline, M: product(swapped(moved), inverse(outline.A)) });
     else {
       g.fillStyle = "#000";
       g.fillRect(0, 0, frame.side, frame.side);
@@ -220,8 +259,11 @@ export class Panel {
         onto(about.A, other);
         g.drawImage(bitmap, -0.5, -0.5);
       }
+      if (outline) {
+        onto(outline.A, other);
+        this.strokeOutline(g, outline.lines, frame.k);
+      }
     }
-    if (view && app.state.contour && bitmap) this.outline(g, (A) => onto(A, other), view, isOther(this.layer) ? "b." : "", frame.k);
     if (view && app.state.cast && !isOther(this.layer)) this.castOf(g, onto, view, frame.k);
     g.setTransform(1, 0, 0, 1, 0, 0);
     this.furniture(g, T, view, frame);
@@ -244,15 +286,8 @@ export class Panel {
       tg.setTransform(1, 0, 0, 1, 0, 0);
       tg.fillStyle = "#000";
       tg.fillRect(0, 0, cell, cell);
-      const T = this.ground(view, small);
-      if (bitmap?.codes) this.levels(tg, bitmap, product(view.A, inverse(swapped(T))), radius);
-      if (app.state.contour) {
-        const onto = (A) => {
-          const [a, b, c, d, e, f] = inverse(A);
-          tg.setTransform(T[0] * a + T[2] * d, T[1] * a + T[3] * d, T[0] * b + T[2] * e, T[1] * b + T[3] * e, T[0] * c + T[2] * f + T[4], T[1] * c + T[3] * f + T[5]);
-        };
-        this.outline(tg, onto, view, "", k);
-      }
+      const T = this.ground(view, small), outline = app.state.contour && this.outline(view, "");
+      if (bitmap?.codes) this.levels(tg, bitmap, product(view.A, inverse(swapped(T))), small, outline && { ...outline, M: product(swapped(T), inverse(outline.A)) });
       g.save();
       g.beginPath();
       g.arc(x + cell / 2, y + cell / 2, radius, 0, 7);
@@ -285,7 +320,7 @@ export class Panel {
   }
 
   // Levels where the screen wants them, between their four neighbours, as greys. M: canvas → picture pixels.
-  levels(g, { codes, width, height }, [a, b, c, d, e, f], radius) {
+  levels(g, { codes, width, height }, [a, b, c, d, e, f], { radius, k }, outline) {
     const side = g.canvas.width, half = side / 2, { grey } = this;
     this.screens ??= new Map();
     if (this.screens.size > 3) this.screens.clear();
@@ -309,21 +344,25 @@ export class Panel {
         out[at] = grey[((upper << 8) + (lower - upper) * q) >> 16];
       }
     }
+    if (outline) for (const line of outline.lines) trace(out, side, radius, line, outline.M, OUTLINE_PX * k);
     g.putImageData(screen, 0, 0);
   }
 
-  outline(g, onto, view, run, k) {
+  // A view's segmented shadow: closed lines (u0, v0, u1, v1, …) in pixels of its mask, and where those lie.
+  outline(view, run) {
     const { app } = this, mask = app.sameStamp(`${run}shadow_mask`, view);
     const lines = mask && app.loader.lines(app.contourAddress(run, mask));
-    if (!lines) return;
-    onto(mask.A);
+    return lines && { lines, A: mask.A };
+  }
+
+  strokeOutline(g, lines, k) {
     g.beginPath();
     for (const line of lines) {
       g.moveTo(line[0], line[1]);
       for (let i = 2; i < line.length; i += 2) g.lineTo(line[i], line[i + 1]);
       g.closePath();
     }
-    this.stroke(g, COLOURS.outline, 1.6 * k);
+    this.stroke(g, COLOURS.outline, OUTLINE_PX * k);
   }
 
   castOf(g, onto, view, k) {
@@ -339,7 +378,9 @@ export class Panel {
     g.setTransform(1, 0, 0, 1, 0, 0);
     g.lineWidth = width;
     g.strokeStyle = colour;
-    g.lineJoin = "round";
+    // Corners as they come, the sharpest cut off: half the time of round ones.
+    g.lineJoin = "miter";
+    g.miterLimit = 2;
     g.stroke();
   }
 
@@ -440,7 +481,7 @@ export class Panel {
     this.slider.wheel = name === "color_by_aspect" ? turn : undefined;
     if (this.slider.bare !== !!this.six) {
       this.slider.bare = !!this.six;
-      this.slider.ring.style.visibility = this.six ? "hidden" : "visible";
+      for (const part of [this.slider.ring, this.slider.dot]) part.style.visibility = this.six ? "hidden" : "visible";
     }
     this.slider.turns = app.state.orientation === "sonar";
     const rings = !this.six && !isOther(name);

@@ -17,6 +17,8 @@ export class CsasSlider extends HTMLElement {
     if (this.picture) return;
     this.picture = this.appendChild(document.createElement("canvas"));
     this.ring = this.appendChild(document.createElement("canvas"));
+    // What moves with every view is no part of the circle, which is then not painted again.
+    this.dot = Object.assign(this.appendChild(document.createElement("span")), { className: "dot" });
     this.tabIndex = 0;
     this.setAttribute("role", "slider");
     this.setAttribute("aria-valuemin", "0");
@@ -24,6 +26,8 @@ export class CsasSlider extends HTMLElement {
     this.setAttribute("aria-valuenow", "0");
     this.setAttribute("aria-label", this.getAttribute("label") ?? "Aspect");
     new ResizeObserver(() => this.resize()).observe(this);
+    for (const [when, on] of [["beforeprint", true], ["afterprint", false]])
+      addEventListener(when, () => { this.onPaper = on; this.drawRing(); });
     this.addEventListener("pointerdown", (e) => {
       if (!this.onRing(e)) return;
       this.setPointerCapture(e.pointerId);
@@ -75,11 +79,12 @@ export class CsasSlider extends HTMLElement {
   resize() {
     const ratio = Math.min(devicePixelRatio, 2);
     this.side = Math.min(this.clientWidth, this.clientHeight);
+    this.corner = [(this.clientWidth - this.side) / 2, (this.clientHeight - this.side) / 2];
     for (const c of [this.picture, this.ring]) {
       c.width = c.height = Math.max(1, Math.round(this.side * ratio));
       c.style.width = c.style.height = `${this.side}px`;
-      c.style.left = `${(this.clientWidth - this.side) / 2}px`;
-      c.style.top = `${(this.clientHeight - this.side) / 2}px`;
+      c.style.left = `${this.corner[0]}px`;
+      c.style.top = `${this.corner[1]}px`;
     }
     this.background = undefined;
     this.drawRing();
@@ -122,24 +127,40 @@ export class CsasSlider extends HTMLElement {
 
   show(aspects, step, index) {
     const same = this.aspects === aspects && this.step === step && this.evidence === this.shownEvidence && this.north === this.shownNorth;
-    if (same && this.index === index && this.wheel === this.shownWheel && this.turn === this.shownTurn) return;
+    const lies = same && this.wheel === this.shownWheel && this.turn === this.shownTurn;
+    if (lies && this.index === index) return;
     Object.assign(this, { aspects, step, index, shownWheel: this.wheel, shownTurn: this.turn, shownEvidence: this.evidence, shownNorth: this.north });
     if (index >= 0) {
       this.setAttribute("aria-valuenow", aspects[index].toFixed(2).replace(/\.?0+$/, ""));
       this.setAttribute("aria-valuetext", `aspect ${aspects[index].toFixed(1)} degrees`);
     }
     if (!same) this.background = undefined;
-    this.drawRing();
+    if (lies) this.moveDot();
+    else this.drawRing();
   }
 
   drawRing() {
     const c = this.ring, size = c.width, k = size / (this.side || 1);
-    this.paintRing(c.getContext("2d"), size, k);
+    this.paintRing(c.getContext("2d"), size, k, this.onPaper);
+    this.moveDot();
+  }
+
+  // Where the cursor is on the circle, CSS pixels.
+  get cursor() {
+    const a = ((this.aspects[this.index] + this.turn) / 360) * TAU;
+    return [this.side / 2 + this.radius * Math.cos(a), this.side / 2 - this.radius * Math.sin(a)];
+  }
+
+  moveDot() {
+    this.dot.hidden = this.index < 0;
+    if (this.index < 0) return;
+    const [x, y] = this.cursor, [left, top] = this.corner, r = 10 * this.em;
+    this.dot.style.transform = `translate(${left + x - r}px, ${top + y - r}px)`;
   }
 
   // Also on another canvas, larger than the screen's: the picture that is saved.
-  paintRing(g, size, k, background) {
-    background ??= this.background?.width === size ? this.background : undefined;
+  paintRing(g, size, k, cursor) {
+    let background = this.background?.width === size ? this.background : undefined;
     if (!background) {
       background = new OffscreenCanvas(size, size);
       this.drawCircle(background.getContext("2d"), size, k);
@@ -153,10 +174,10 @@ export class CsasSlider extends HTMLElement {
     g.setTransform(1, 0, 0, 1, 0, 0);
     if (this.wheel !== undefined) this.drawWheel(g, size, k);
     this.drawDegrees(g, size, k);
-    if (this.index < 0) return;
-    const a = ((this.aspects[this.index] + this.turn) / 360) * TAU;
+    if (!cursor || this.index < 0) return;
+    const [x, y] = this.cursor;
     g.beginPath();
-    g.arc(size / 2 + this.radius * k * Math.cos(a), size / 2 - this.radius * k * Math.sin(a), 9 * k * this.em, 0, TAU);
+    g.arc(x * k, y * k, 9 * k * this.em, 0, TAU);
     g.fillStyle = "#29d85a";
     g.fill();
     g.lineWidth = 2 * k;
