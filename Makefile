@@ -90,8 +90,8 @@ types: install ## mypy
 
 unit: install ## pytest alone
 	@mkdir -p $(ROS_LOG_DIR)
-	$(PY) -m pytest -n $(PYTEST_WORKERS) --ignore=test/nodes
-	$(PY) -m pytest -n $(PYTEST_WORKERS) test/nodes --ignore=test/nodes/test_processes.py
+	$(PY) -m pytest -n $(PYTEST_WORKERS) --dist loadgroup --ignore=test/nodes
+	$(PY) -m pytest -n $(PYTEST_WORKERS) --dist loadgroup test/nodes --ignore=test/nodes/test_processes.py
 	$(PY) -m pytest test/nodes/test_processes.py  # looks at all of the machine's shared memory: alone on it
 
 long: install ## the tests that `make test` leaves out: more of the same

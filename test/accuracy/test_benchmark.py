@@ -22,6 +22,10 @@ SIZE = {"length_m": 0.8, "width_m": 0.4, "height_m": 0.4, "volume_m3": 0.128}
 VOXEL_M = 0.02
 
 
+#: The first run is dear: one worker makes it.
+of_first_run = pytest.mark.xdist_group("first run")
+
+
 @pytest.fixture(scope="module")
 def settings(accuracy):
     return accuracy.Settings("tiny", 15.0, (accuracy.WITH_FFSE,))
@@ -47,6 +51,7 @@ def without_time(rows):
 # ---- rows as they come
 
 
+@of_first_run
 def test_every_case_is_written_down_and_reported_as_it_is_done(first_run, cases):
     rows, written, said = first_run
     assert [row.case for row in rows] == cases
@@ -55,6 +60,7 @@ def test_every_case_is_written_down_and_reported_as_it_is_done(first_run, cases)
     assert said[1].startswith(f"2/{len(cases)} empty, seed 1, clean: no object")
 
 
+@of_first_run
 def test_an_interrupted_run_goes_on_after_the_last_whole_row(accuracy, settings, cases, first_run, tmp_path):
     rows, written, _ = first_run
     first, second, _ = written.splitlines()
@@ -71,6 +77,7 @@ def test_an_interrupted_run_goes_on_after_the_last_whole_row(accuracy, settings,
     assert set(accuracy.read_rows(record, settings)) == set(cases)
 
 
+@of_first_run
 def test_a_run_that_was_complete_scores_nothing_again(accuracy, settings, cases, first_run, tmp_path):
     rows, written, _ = first_run
     record = tmp_path / "run.jsonl"
@@ -80,6 +87,7 @@ def test_a_run_that_was_complete_scores_nothing_again(accuracy, settings, cases,
     assert len(said) == 1
 
 
+@of_first_run
 def test_rows_of_other_settings_or_other_code_are_not_taken(
     accuracy, settings, first_run, tmp_path, monkeypatch
 ):
@@ -141,6 +149,7 @@ def test_the_wider_lattice_holds_the_target_and_keeps_the_voxels_where_they_are(
     assert not (truth & ~hull).any()
 
 
+@of_first_run
 def test_a_tiny_run_scores_every_method_and_finds_the_box_about_where_it_is(accuracy, first_run):
     clean = first_run[0][0]
     assert clean.found

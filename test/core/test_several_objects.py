@@ -23,6 +23,9 @@ from csas_shadow_ros.core.shape.volume import Target, Volume, VoxelGrid
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.targets import box, cylinder, join_bodies
 
+#: A scene and what was found in it are dear: one worker makes each.
+of_two, of_laying_grid = (pytest.mark.xdist_group(name) for name in ("two objects", "laying grid"))
+
 #: Coarse, for speed: 60 views a circle, voxels of 2.5 cm.
 COARSE = PipelineParameters(
     sub_aperture=SubApertureParameters(step_deg=6.0, check_sign=False),
@@ -62,6 +65,7 @@ def block_grid(low, high, *, origin=(0.0, 0.0), voxel=0.1, shape=(8, 12, 12)):
     return VoxelGrid(volume, np.zeros(shape, np.float32), np.ones(shape, np.uint16), 0.03, occupied)
 
 
+@of_two
 def test_two_separate_bodies_are_two_objects_each_where_and_as_large_as_it_is(two, two_objects):
     _, middles = two
     objects = sorted(two_objects.objects, key=lambda o: o.dimensions.position_m[0])
@@ -79,6 +83,7 @@ def test_two_separate_bodies_are_two_objects_each_where_and_as_large_as_it_is(tw
         assert one.views_used == 60
 
 
+@of_two
 def test_each_object_is_carved_in_a_volume_of_its_own_that_holds_it_alone(two, two_objects):
     first, second = two_objects.objects
     for one, other in ((first, second), (second, first)):
@@ -91,6 +96,7 @@ def test_each_object_is_carved_in_a_volume_of_its_own_that_holds_it_alone(two, t
         )
 
 
+@of_two
 def test_what_else_is_known_to_stand_there_takes_nothing_from_the_target(two, two_objects):
     run, _ = two
     alone = pipeline.run(run.image, run.track, COARSE, max_objects=1)
@@ -102,6 +108,7 @@ def test_what_else_is_known_to_stand_there_takes_nothing_from_the_target(two, tw
     assert "no more than 1" in alone.left_out[0].reason
 
 
+@of_two
 def test_the_mean_likelihood_of_the_target_does_not_change_by_one_bit_however_many_bodies_are_carved(two):
     run, _ = two
     p = replace(
@@ -116,6 +123,7 @@ def test_the_mean_likelihood_of_the_target_does_not_change_by_one_bit_however_ma
     assert alone.dimensions == several.dimensions
 
 
+@of_two
 def test_a_target_that_is_given_is_the_only_object(two):
     run, middles = two
     given = TargetParameters(target="given", position_m=middles[1])
@@ -125,6 +133,7 @@ def test_a_target_that_is_given_is_the_only_object(two):
     assert result.objects[0].dimensions.position_m == pytest.approx(middles[1], abs=0.1)
 
 
+@of_laying_grid
 def test_the_laying_grid_does_not_merge_with_the_target_in_it(in_laying_grid):
     run, result = in_laying_grid
     (low, high), volume = run.truth.target.bounds, result.grid.volume
@@ -136,6 +145,7 @@ def test_the_laying_grid_does_not_merge_with_the_target_in_it(in_laying_grid):
     assert result.dimensions.length_m < 1.2 + 0.35
 
 
+@of_laying_grid
 def test_every_object_told_in_the_laying_grid_is_really_there(in_laying_grid):
     run, result = in_laying_grid
     assert any("phantom" in left.reason for left in result.left_out)

@@ -76,7 +76,14 @@ class Told:
         return np.load(self.folder / "grid.npz")[name]
 
 
-@pytest.fixture(scope="module", params=["box", "two bodies", pytest.param("frame", marks=pytest.mark.long)])
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param("box", marks=pytest.mark.xdist_group("told of a box")),
+        pytest.param("two bodies", marks=pytest.mark.xdist_group("told of two bodies")),
+        pytest.param("frame", marks=[pytest.mark.long, pytest.mark.xdist_group("told of a frame")]),
+    ],
+)
 def told(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Told]:
     """One scene, told in five ways."""
     profile, target, seed = SCENES[request.param]
