@@ -172,8 +172,11 @@ class VoxelCarverNode(CsasNode):
     # What to say of it
 
     def waiting(self) -> str:
-        """Say so if views wait for the target."""
-        return self.target.missing() if self.inlet.held else ""
+        """Say so if views wait for the target, or the rest of the run for a source that is away."""
+        if self.inlet.held:
+            return self.target.missing()
+        silent_s = 0.0 if self.growing.final or self.growing.complete else self.growing.silent_s
+        return f"the source of views has been silent for {silent_s:.0f} s" if silent_s else ""
 
     def state_counts(self) -> dict[str, int]:
         """Return how many views the grid holds, and whether that is all."""

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from csas_shadow_ros.graph.processes import (
     start_fork_server,
 )
 from csas_shadow_ros.graph.replay import replay
+from csas_shadow_ros.nodes.runtime import hearing
 from csas_shadow_ros.nodes.runtime.shared_memory import segments_of
 from csas_shadow_ros.simulation import SimulatedRun
 
@@ -546,6 +547,100 @@ def test_a_node_that_begins_while_another_process_holds_its_port_waits_until_it_
                 names = [os.path.basename(path) for path in links(pid)]
                 ports = [name for name in names if "_port" in name and name.endswith("_el")]
                 time.sleep(0.05)
+
+
+# Has files open, and replaces them when it is told to.
+HOLDS = """
+import mmap, os, sys
+opened = [mmap.mmap(os.open(path, os.O_RDWR), 0) for path in sys.argv[1:]]
+print("holds", flush=True)
+input()
+for path in sys.argv[1:]:
+    os.unlink(path)
+print("removed", flush=True)
+input()
+"""
+
+
+@contextlib.contextmanager
+def holding(*paths: Path | str) -> Iterator[tuple[Callable[[], None], Callable[[], None]]]:
+    """Have another process hold files open; give what has it remove them, and what ends it."""
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDS, *map(str, paths)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as holder:
+        assert holder.stdin is not None
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "holds\n"
+
+        def remove() -> None:
+            holder.stdin.write("\n")
+            holder.stdin.flush()
+            assert holder.stdout.readline() == "removed\n"
+
+        def end() -> None:
+            holder.kill()
+            holder.wait()
+
+        yield remove, end
+        holder.kill()
+
+
+def test_it_is_found_out_that_others_write_to_a_file_that_a_port_has_replaced(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(hearing, "_LOOKS_S", (0.0, 0.0))
+    port = Path(f"/dev/shm/fastrtps_port{70_000 + os.getpid()}")
+    owner = port.with_name(f"{port.name}_el")
+    port.write_bytes(b"\0" * 4096)
+    with contextlib.ExitStack() as stack:
+        for path in (port, owner):
+            stack.callback(path.unlink, missing_ok=True)
+        stack.enter_context(owner.open("w"))
+        remove, end = stack.enter_context(holding(port))
+        assert [hearing.Reach().is_lost() for _ in range(3)] == [False] * 3, "the one that is read"
+        remove()
+        port.write_bytes(b"\0" * 4096)
+        reach = hearing.Reach()
+        assert [reach.is_lost() for _ in range(3)] == [False, True, False], "twice seen, once said"
+        assert reach.is_given_up
+        reach = hearing.Reach()
+        assert not reach.is_lost()
+        end()
+        assert not reach.is_lost(), "as a rule it is let go of"
+        assert not reach.is_given_up
+
+
+@pytest.mark.long
+def test_a_node_begins_anew_until_nobody_writes_to_a_file_that_its_port_has_replaced(
+    domain: int, tmp_path: Path
+) -> None:
+    with Graph({"composites": {}}, domain, tmp_path) as graph:
+        process = graph.processes["composites"]
+
+        def ports() -> list[str]:
+            owned = [path for path in links(process.pid) if "_port" in path and path.endswith("_el")]
+            return [path.removesuffix("_el") for path in owned]
+
+        deadline = time.monotonic() + 120
+        while len(ports()) != 2:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        with holding(*ports()) as (remove, end):
+            os.kill(process.pid, signal.SIGKILL)
+            remove()
+            while "begins anew" not in process.log.read_text():
+                assert time.monotonic() < deadline
+                graph.watch()
+                time.sleep(0.05)
+            end()
+        said = process.log.read_text().count("begins anew")
+        time.sleep(15.0)
+        assert process.log.read_text().count("begins anew") <= said + 1
+        assert process.poll() is None
+        assert process.log.read_text().rstrip().splitlines()[-1].split("]: ")[1].startswith("active")
 
 
 def links(pid: int) -> list[str]:

@@ -68,7 +68,7 @@ from msg_adapters.topics import topic as topic_of
 
 from .. import qos
 from .flow import Flow
-from .hearing import make_hearing
+from .hearing import LET_GO_S, Reach, make_hearing
 from .host import Host
 from .params import DYNAMIC, NODES, declare, from_overrides
 from .rivals import Rivals
@@ -1260,11 +1260,26 @@ def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> in
         node.destroy_node()
         rclpy.try_shutdown(context=node.context)
 
+    while True:
+        reach, code = _run_once(kind, make, take_back, stop)
+        if not reach.is_given_up or stop.is_set():
+            return code
+        time.sleep(LET_GO_S)
+
+
+def _run_once(
+    kind: type[CsasNode],
+    make: Callable[[], CsasNode],
+    take_back: Callable[[CsasNode], None],
+    stop: threading.Event,
+) -> tuple[Reach, int]:
+    """Run a node until it is told to stop, or others do not reach it; return that, and the exit status."""
     try:
         node = make_hearing(make, take_back)
     except ParameterError as error:
         sys.stderr.write(f"{kind.name}: {error}\n")
-        return 2
+        return Reach(), 2
+    reach = Reach()
     context = node.context
     code = 0
     try:
@@ -1273,7 +1288,7 @@ def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> in
                 sys.stderr.write(f"{kind.name}: {node.error or 'could not be started'}\n")
                 code = 2
             else:
-                spin(node, stop)
+                spin(node, stop, reach)
         finally:
             node.stop()
             node.destroy_node()
@@ -1286,7 +1301,7 @@ def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> in
         rclpy.try_shutdown(context=context)
         if _is_orphan() and domain_id is not None:
             tidy_up_after_a_killed_graph(domain_id, float(os.environ["CSAS_SINCE_S"]))
-    return code
+    return reach, code
 
 
 def _is_orphan() -> bool:
@@ -1310,8 +1325,11 @@ def make_executor(context: Context) -> Executor:
         return SingleThreadedExecutor(context=context)
 
 
-def spin(node: CsasNode, stop: threading.Event) -> None:
-    """Spin until told to stop; a message that cannot even be taken is counted, not fatal."""
+def spin(node: CsasNode, stop: threading.Event, reach: Reach | None = None) -> None:
+    """Spin until told to stop, or until it is known that others do not reach this process.
+
+    A message that cannot even be taken is counted, not fatal.
+    """
     executor = make_executor(node.context)
     executor.add_node(node)
     node.start_waiting_work()
@@ -1325,6 +1343,11 @@ def spin(node: CsasNode, stop: threading.Event) -> None:
                 node.fault("message could not be taken", error)
             if _is_orphan():
                 return  # whoever started us is gone without ending us
+            if reach is not None and reach.is_lost():
+                node.get_logger().warning(
+                    "others send to a port in shared memory of a killed predecessor: this node begins anew"
+                )
+                return
     finally:
         executor.remove_node(node)
         executor.shutdown(timeout_sec=1.0)

@@ -1,11 +1,20 @@
-"""A participant that lacks a port in shared memory hears nobody, and nobody says so: it is made again."""
+"""A participant that nobody can reach at its ports in shared memory hears nobody, unsaid: it is made again.
+
+Two things leave one so. Its predecessor still holds a port's lock, and the middleware goes on without that
+port (`make_hearing`). Or the predecessor was killed in its first moment, before anything listened at its
+port: the middleware makes the file anew, and whoever has the old one open never finds out, and goes on
+writing to that (`Reach`).
+"""
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
+import re
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 Made = TypeVar("Made")
@@ -13,15 +22,20 @@ Made = TypeVar("Made")
 #: The middleware's files in shared memory that this process holds locked: a segment's, and its ports'.
 _SHARED, _OWNER = "/dev/shm/fastrtps_", "_el"
 _FILES = "/proc/self/fd"
+#: A file that is open and has another in its place, as the kernel tells of it.
+_DELETED = re.compile(rf"({_SHARED}port\d+) \(deleted\)")
 #: A participant listens at two ports: what it discovers comes by the one, all else by the other.
 _PORTS = 2
 #: A process that is killed lets go of its ports within milliseconds, on a busy one within seconds.
 _PATIENCE_S, _AGAIN_S = 10.0, 0.2
+#: When (s after a start) to look for older files of its ports, and how long to leave ports without an owner:
+#: every process looks once a second for such ports, and closes them.
+_LOOKS_S, LET_GO_S = (5.0, 8.0), 2.0
 
 
-def _held() -> tuple[int, int]:
-    """Return how many segments and how many ports this process holds."""
-    segments = ports = 0
+def _held() -> tuple[int, set[str]]:
+    """Return how many segments this process holds, and the files of its ports."""
+    segments, ports = 0, set()
     for entry in os.listdir(_FILES):
         try:
             path = os.readlink(f"{_FILES}/{entry}")
@@ -29,10 +43,46 @@ def _held() -> tuple[int, int]:
             continue  # of the listing itself
         if path.startswith(_SHARED) and path.endswith(_OWNER):
             if "_port" in path:
-                ports += 1
+                ports.add(path.removesuffix(_OWNER))
             else:
                 segments += 1
     return segments, ports
+
+
+def _replaced(ports: set[str]) -> set[str]:
+    """Return those ports of which another process has an older file open: nobody reads what it writes."""
+    found: set[str] = set()
+    for other in Path("/proc").glob("[0-9]*/maps"):
+        # Of another user, or gone meanwhile.
+        with contextlib.suppress(OSError):
+            found |= set(_DELETED.findall(other.read_text(errors="replace")))
+    return ports & found
+
+
+class Reach:
+    """Whether others reach this process at the ports that it has made.
+
+    A file that is replaced is let go of within 3 s as a rule, when the middleware finds that nobody reads it.
+    It is looked for twice, later than that.
+    """
+
+    def __init__(self) -> None:
+        self._ports = _held()[1] if os.path.isdir(_FILES) else set()
+        began_s = time.monotonic()
+        self._looks_s = [began_s + after_s for after_s in _LOOKS_S] if self._ports else []
+        #: Whether it was found that they do not.
+        self.is_given_up = False
+
+    def is_lost(self) -> bool:
+        """Say whether somebody goes on writing to what this process does not read."""
+        if not self._looks_s or time.monotonic() < self._looks_s[0]:
+            return False
+        del self._looks_s[0]
+        self._ports = _replaced(self._ports)
+        if not self._ports:
+            self._looks_s = []
+        self.is_given_up = bool(self._ports) and not self._looks_s
+        return self.is_given_up
 
 
 def make_hearing(make: Callable[[], Made], take_back: Callable[[Made], None]) -> Made:
@@ -58,10 +108,11 @@ def make_hearing(make: Callable[[], Made], take_back: Callable[[Made], None]) ->
         return make()
     end = time.monotonic() + _PATIENCE_S
     while True:
-        before = _held()
+        segments_before, ports_before = _held()
         made = make()
-        segments, ports = (now - then for now, then in zip(_held(), before, strict=True))
-        if segments <= 0 or ports >= _PORTS:  # without shared memory there is nothing to miss
+        segments, ports = _held()
+        # Without shared memory there is nothing to miss.
+        if segments <= segments_before or len(ports - ports_before) >= _PORTS:
             return made
         take_back(made)
         del made

@@ -8,7 +8,11 @@ from collections.abc import Callable
 
 #: Without a source that tells the end, a result that has not changed for so long is shown as it is.
 IDLE_S = 2.0
-_SOURCE_TIMEOUT_S = 3.0
+#: A source that is silent for so long is away; what has come is shown.
+SOURCE_SILENT_S = 3.0
+#: A source that has spoken and falls silent was killed, as a rule, and its successor goes on: after 5 s on a
+#: busy machine. One that has not come back by then (as long as a source waits for a sink) will not.
+SOURCE_GONE_S = 60.0
 #: After a burst of views that has been over for so long, publishing holds up nobody.
 _QUIET_S = 0.06
 
@@ -34,10 +38,11 @@ class Growing:
         self.complete = False
         #: Whether what is published is the end result, as far as anybody knows.
         self.final = False
-        self._dirty = False
+        #: Whether something has changed since anything was published, and since an end result was.
+        self._dirty = self._open = False
         self._ended = False
-        self._published_s = self._changed_s = -1e9
-        self._source_s = -1e9
+        self._published_s = self._changed_s = -math.inf
+        self._source_s = -math.inf
         self._cost_s = 0.0
 
     def set_rate(self, hz: float) -> None:
@@ -46,15 +51,23 @@ class Growing:
 
     def changed(self) -> None:
         """Say that the result has changed."""
-        self._dirty, self.complete, self._changed_s = True, False, time.monotonic()
+        self._dirty = self._open = True
+        self.complete = self.final = False
+        self._changed_s = time.monotonic()
 
     def source_says(self, ended: bool) -> None:
         """Take a source's word whether every view has come."""
         self._source_s, self._ended = time.monotonic(), ended
 
+    @property
+    def silent_s(self) -> float:
+        """Seconds since the source that had spoken fell silent; 0 if it has not, or if there is none."""
+        silent_s = time.monotonic() - self._source_s
+        return silent_s if SOURCE_SILENT_S < silent_s < math.inf else 0.0
+
     def begin_again(self) -> None:
         """Wait for another result; what was published stays as it is."""
-        self.complete = self.final = self._dirty = self._ended = False
+        self.complete = self.final = self._dirty = self._open = self._ended = False
 
     def finish(self) -> None:
         """Publish the end result now, whatever anybody has said."""
@@ -69,16 +82,18 @@ class Growing:
             # Also where nothing came at all: that is a result too.
             self._do(now)
             self.complete = True
-        elif self._dirty:
-            settled = now - self._source_s > _SOURCE_TIMEOUT_S and now - self._changed_s > IDLE_S
+        elif self._open:
+            silent_s = now - self._source_s
+            rests = silent_s > SOURCE_SILENT_S and now - self._changed_s > IDLE_S
+            self.final = rests and silent_s > SOURCE_GONE_S
             quiet = now - self._changed_s > _QUIET_S
             due = now - self._published_s > max(self.period_s, 0.0 if quiet else 10.0 * self._cost_s)
-            self.final = settled
-            if settled or (due and self._wanted()):
+            if self.final or (self._dirty and (rests or (due and self._wanted()))):
                 self._do(now)
 
     def _do(self, now: float) -> None:
         self._dirty = False
+        self._open = self._open and not self.final
         self._publish()
         self._published_s = time.monotonic()
         self._cost_s = self._published_s - now
