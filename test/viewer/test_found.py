@@ -12,6 +12,7 @@ import threading
 import urllib.error
 import urllib.request
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -164,6 +165,16 @@ def test_a_link_brings_rulers_and_the_camera_back(watched, serve, run_store):
     watched.page.goto("about:blank")
     watched.open(link)
     assert watched.js("csas.rulersHere().map(r => r.ends)") == [[[0.1, 0.2], [0.1, -0.9]]]
+    assert watched.js("csas.solid.seenFrom()") == pytest.approx([3, 2, 1, 0.1, 0.2, 0.3], abs=1e-3)
+
+
+def test_a_target_that_comes_late_leaves_the_camera_of_a_link(watched, serve):
+    store = ViewStore(title="late")
+    for i in range(3):
+        store.put_view("shadow", entry(i))
+    watched.open(f"{serve(store)}#" + quote(json.dumps({"camera": [3, 2, 1, 0.1, 0.2, 0.3]})))
+    watched.until("csas.solid?.renderer")
+    watched.js("csas.notice({type: 'part', part: 'target', value: {centre: [1, 1], size: [1, 1, 1]}})")
     assert watched.js("csas.solid.seenFrom()") == pytest.approx([3, 2, 1, 0.1, 0.2, 0.3], abs=1e-3)
 
 

@@ -159,7 +159,10 @@ class App {
   part(name) {
     if (name === "track" || name === "target") {
       this.solid?.surroundings();
-      if (this.solid && name === "target" && this.scene.target && !this.looked) { this.looked = true; this.solid.whole(false); }
+      if (this.solid && name === "target" && this.scene.target && !this.looked) {
+        this.looked = true;
+        if (!this.state.camera.length) this.solid.whole(false); // a link says where from, however late the target comes
+      }
     } else if (name === "volumes" && this.solid) {
       for (const each of new Set(["main", "other", ...Object.keys(this.volumes), ...Object.keys(this.scene.volumes)])) if (this.scene.volumes[each]) this.fetchVolume(each); else this.dropVolume(each);
     } else if (name === "damage") {
