@@ -672,7 +672,7 @@ def acceptance(rows: Sequence[Row], voxel_size_m: float) -> list[Line]:
     )
     held = [ok for r in clean for ok in intervals_hold(r)]
     add(
-        "95 % intervals of length, width and height, clean, hold the truth: at least"
+        "95 % intervals of length, width and height, clean, contain the truth: at least"
         f" {_percent(LEAST_COVERAGE)}",
         held,
         lambda: f"{_percent(_mean(held))} ({sum(held)} of {len(held)})",
@@ -836,9 +836,9 @@ def page(rows: Sequence[Row], settings: Settings, arguments: Sequence[str], figu
     lines = [
         "# Accuracy",
         "",
-        "How near the carved voxels come to the *shadow hull* (what perfect shadows of the true target would",
-        "leave, the best that carving can give) and to the truth: fully automatic, default parameters, the",
-        "same rule for every target. Written by:",
+        "How close the carved voxels come to the truth and to the *shadow hull*, the shape that perfect",
+        "shadows of the true target would leave and the best that carving can give. Fully automatic, with",
+        "default parameters and the same rule for every target. Written by:",
         "",
         f"    python benchmarks/accuracy.py {' '.join(arguments)}".rstrip(),
         "",
@@ -846,13 +846,13 @@ def page(rows: Sequence[Row], settings: Settings, arguments: Sequence[str], figu
         f" The seed fixes speckle, position and heading ({poses or 'none'}).",
         "All numbers are in the .json file beside this page.",
         "",
-        "## What is asked, and what is measured",
+        "## Requirements and measurements",
         "",
-        f"By the default method ({DEFAULT_METHOD}, with shadow enhancement), over"
+        f"Default method ({DEFAULT_METHOD}, with shadow enhancement), over"
         f" {', '.join(_present(rows, COMPACT)) or 'no target'}.",
-        "What the automatic volume cuts off counts as missed.",
+        "Parts of the target outside the automatic volume count as missed.",
         "",
-        "| asked | measured | |",
+        "| required | measured | |",
         "|---|---|---|",
     ]
     lines += [f"| {a.wanted} | {a.measured} | {verdict[a.met]} |" for a in acceptance(rows, voxel)]
@@ -866,8 +866,8 @@ def page(rows: Sequence[Row], settings: Settings, arguments: Sequence[str], figu
         "",
         f"Of the {DEFAULT_METHOD} method: found minus true, mean over the seeds, without faults. Within"
         f" tolerance: {_percent(SIZE_TOLERANCE)} or one voxel, whichever is larger.",
-        "In the interval: the 95 % interval that the result states contains the truth. That of the volume is",
-        "of the shadow hull's volume, which is larger than the truth's where no shadow shows a hollow.",
+        "In the interval: the truth lies in the 95 % interval of the result. The volume's interval is that",
+        "of the shadow hull, which is larger than the truth if no shadow shows a hollow.",
         "",
         *dimension_tables(rows, conditions, voxel),
         "",

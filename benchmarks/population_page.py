@@ -83,7 +83,7 @@ def acceptance(rows: Sequence[Row]) -> list[Line]:
     asked = bodies_of(rows, asked=True)
     ious = [b.iou_hull for _, b in asked]
     middle, tenth = _quantile(ious, 0.5), _quantile(ious, 0.1)
-    where = "where it can be asked*"
+    where = "where it is required*"
     add(
         f"IoU with the shadow hull, {where}: median ≥ {MEDIAN_IOU:.2f}",
         ious,
@@ -101,7 +101,7 @@ def acceptance(rows: Sequence[Row]) -> list[Line]:
     held = [h for r, b in asked for n in SIZES if (h := b.holds(n)) is not None]
     low, high = COVERAGE
     add(
-        f"95 % intervals hold the truth: {100 * low:.0f} to {100 * high:.0f} %",
+        f"95 % intervals contain the truth: {100 * low:.0f} to {100 * high:.0f} %",
         held,
         _of(held),
         low <= _share(held) <= high,
@@ -183,7 +183,7 @@ def family_table(rows: Sequence[Row]) -> list[str]:
     for family in dict.fromkeys(b.family for _, b in sorted(pairs, key=lambda p: p[1].family)):
         lines.append(_group_row(family, [p for p in pairs if p[1].family == family]))
     lines.append(_group_row("**all**", pairs))
-    lines.append(_group_row("where it can be asked*", bodies_of(rows, asked=True)))
+    lines.append(_group_row("where it is required*", bodies_of(rows, asked=True)))
     return lines
 
 
@@ -250,7 +250,7 @@ def worst_table(rows: Sequence[Row]) -> list[str]:
 def tables(rows: Sequence[Row]) -> list[str]:
     """Write what is asked and what was measured."""
     verdict = {True: "met", False: "**not met**", None: "–"}
-    lines = ["| asked | measured | |", "|---|---|---|"]
+    lines = ["| required | measured | |", "|---|---|---|"]
     return lines + [f"| {a.wanted} | {a.measured} | {verdict[a.met]} |" for a in acceptance(rows)]
 
 
@@ -272,7 +272,7 @@ def page(rows: Sequence[Row], half: str, figures: Mapping[str, str]) -> str:
     lines = [
         "# Accuracy",
         "",
-        "How the chain does, fully automatic and with default parameters, on scenes drawn at random."
+        "Results of the chain, fully automatic and with default parameters, on scenes drawn at random."
         " Written by:",
         "",
         f"    python benchmarks/population.py --half {half} --scenes {len(rows)} --out FOLDER",
@@ -280,17 +280,17 @@ def page(rows: Sequence[Row], half: str, figures: Mapping[str, str]) -> str:
         "",
         f"{sum(bool(r.bodies) for r in rows)} scenes with objects, {sum(not r.bodies for r in rows)} without,"
         f" of the {half} half (code {', '.join(codes) or 'unknown'}).",
-        "The halves share no shape family. What the automatic volume cuts off, and a body that was not",
-        "found, count as missed. *Hull*: what perfect silhouettes of the body alone would leave, the best",
-        "that carving can give. True sizes are of the part above the seabed, by the rule of the report:",
-        "the smallest rectangle round the plan, and the highest point.",
+        "The halves share no shape family. Parts outside the automatic volume, and bodies that were not",
+        "found, count as missed. *Hull*: the shape that perfect silhouettes of the body alone would leave,",
+        "the best that carving can give. True sizes are of the part above the seabed, by the rule of the",
+        "report: the smallest rectangle round the plan, and the highest point.",
         "",
-        "## What is asked, and what is measured",
+        "## Requirements and measurements",
         "",
         *tables(rows),
         "",
         f"\\* Contrast of {LEAST_CONTRAST_DB:g} dB or more, and a shadow in the image of at least"
-        f" {LEAST_SHADOW_CELLS:g} cells. What was missed there has IoU 0, and no extent within 5 %.",
+        f" {LEAST_SHADOW_CELLS:g} cells. A body missed there has IoU 0, and no extent within 5 %.",
         "",
     ]
     lines += [f"![{text}]({path})\n" for path, text in figures.items() if "scene" not in Path(path).stem]
@@ -299,7 +299,7 @@ def page(rows: Sequence[Row], half: str, figures: Mapping[str, str]) -> str:
     lines += ["## The worst ten", "", "By IoU of the main body with its hull.", "", *worst_table(rows), ""]
     lines += [f"![{text}]({path})\n" for path, text in figures.items() if "scene" in Path(path).stem]
     lines += [
-        "## What is drawn",
+        "## How scenes are drawn",
         "",
         f"- families of this half, in turn: {kinds}",
         "- largest extent log-uniform within 0.1 to 4 m, by family; heading and place uniform, the place up"
