@@ -170,7 +170,7 @@ STREAMS: dict[str, ImageStream] = {
             (VOXEL_ENCODING,),
             CSAS_VOXEL_GRID,
             "likelihood",
-            "dense voxel grid: rows y (north up), columns x, one channel a height",
+            "dense voxel grid: rows y (north up), columns x, one channel per height",
         ),
         ImageStream(
             "voxel_views",
@@ -226,11 +226,11 @@ def _topics() -> dict[str, Topic]:
         ),
         Topic("objects", MARKERS, "each object as an oriented CUBE and a label; DELETE: gone"),
         Topic("measurements", DIAGNOSTICS, "measures of each object, verdict and quality of the run"),
-        Topic("evidence", DIAGNOSTICS, "what each view contributed to the grid: one status a view"),
-        Topic("search", DIAGNOSTICS, "what is to be carved, and what is left out and why"),
-        Topic("origin", NAV_SAT_FIX, "where on earth the scene's origin is, and how sure that is"),
-        Topic("scene_transform", TRANSFORM, "the scene's frame in parent_frame, where there is a datum"),
-        Topic("progress", DIAGNOSTICS, "what became of each view, and the nodes' heartbeats"),
+        Topic("evidence", DIAGNOSTICS, "what each view contributed to the grid: one status per view"),
+        Topic("search", DIAGNOSTICS, "what to carve, and what is left out and why"),
+        Topic("origin", NAV_SAT_FIX, "position on earth of the scene's origin, with its covariance"),
+        Topic("scene_transform", TRANSFORM, "the scene's frame in parent_frame, if there is a datum"),
+        Topic("progress", DIAGNOSTICS, "the fate of each view, and the nodes' heartbeats"),
         Topic("/diagnostics", DIAGNOSTICS, "views in, out, rejected and why, rates"),
     ]
     return {t.name: t for t in topics}
@@ -392,7 +392,7 @@ def topic_table() -> str:
     sets = (*(f"{s}/*" for s in PREFIXED_STREAMS), "voxels", "mesh")
     for prefix, holds in (
         ("object_N", f"of further objects, N from {FIRST_FURTHER} to {LAST_FURTHER}"),
-        (OTHER_METHOD, "of the grid by the other method, where it is asked for"),
+        (OTHER_METHOD, "of the grid by the other method, if requested"),
     ):
         names = ", ".join(f"`{prefix}/{name}`" for name in sets)
         lines.append(f"| {names} | as without prefix | as without prefix | {holds} |")

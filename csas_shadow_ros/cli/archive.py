@@ -15,20 +15,20 @@ def add_archive(add: Callable[..., argparse.ArgumentParser]) -> None:
     """Add ``batch``, ``catalogue`` and ``find``."""
     add(
         "batch",
-        "process many bags into an archive, with a catalogue of what is in them",
+        "process many bags into an archive, with a catalogue of the results",
         "  csas-shadow batch runs/ --out season --workers 4\n"
         "  csas-shadow batch 'runs/*_leg3' @more.txt --out season --step-deg 2 --redo failed\n"
         "  csas-shadow batch runs/ --out season --scheduler tcp://cluster:8786\n\n"
-        "SOURCE is a bag, a folder of which every bag below is taken, a pattern, or @FILE with a line each.\n"
-        "What is done is not done again: the same command goes on after anything. A bag that fails is a row\n"
-        "of the catalogue and a line of failed.txt; exit code 3 says that there are such. Ctrl-C ends with\n"
-        "the bags that are being processed, a second one at once.",
+        "SOURCE is a bag, a folder (every bag below it), a pattern, or @FILE with one of these per line.\n"
+        "The same command resumes after any interruption and repeats nothing. A bag that fails is a row\n"
+        "of the catalogue and a line of failed.txt, and makes exit code 3. Ctrl-C finishes the bags in\n"
+        "progress; a second Ctrl-C ends at once.",
         _batch,
         _batch_options,
     )
     catalogue = add(
         "catalogue",
-        "make the catalogue of an archive anew, from the results that lie in it",
+        "rebuild the catalogue of an archive from its results",
         "  csas-shadow catalogue season\n\n"
         "writes DIR/catalogue/runs.parquet and contacts.parquet; DIR may be any folder with results.",
         _catalogue,
@@ -37,7 +37,7 @@ def add_archive(add: Callable[..., argparse.ArgumentParser]) -> None:
     output_options(catalogue)
     find = add(
         "find",
-        "ask the catalogue of an archive",
+        "query the catalogue of an archive",
         "  csas-shadow find season --where \"length_m > 1 and verdict == 'object'\"\n"
         "  csas-shadow find season --near 48.36 -4.55 200 --where \"quality <> 'not trustworthy'\"\n"
         "  csas-shadow find season --same\n"
@@ -46,49 +46,60 @@ def add_archive(add: Callable[..., argparse.ArgumentParser]) -> None:
         _find,
     )
     find.add_argument("archive", metavar="DIR", help="an archive")
-    find.add_argument("--where", metavar="EXPRESSION", help="keep the rows for which it is true")
+    find.add_argument("--where", metavar="EXPRESSION", help="keep rows for which this is true")
     find.add_argument(
-        "--near", type=float, nargs=3, metavar=("LAT", "LON", "RADIUS"), help="in a circle (degrees, m)"
+        "--near",
+        type=float,
+        nargs=3,
+        metavar=("LAT", "LON", "RADIUS"),
+        help="keep rows in this circle (degrees, m)",
     )
-    find.add_argument("--same", action="store_true", help="objects that are in several runs, numbered")
-    find.add_argument("--limit", type=int, metavar="N", help="at most so many rows (default: all)")
+    find.add_argument("--same", action="store_true", help="number objects that several runs show")
+    find.add_argument("--limit", type=int, metavar="N", help="print at most this many rows (default: all)")
     output_options(find)
 
 
 def _batch_options(p: argparse.ArgumentParser) -> None:
-    p.add_argument("sources", nargs="+", metavar="SOURCE", help="bag, folder, pattern, or @FILE of such")
-    p.add_argument("--out", required=True, metavar="ARCHIVE", help="archive to make, or to go on with")
+    p.add_argument(
+        "sources", nargs="+", metavar="SOURCE", help="bag, folder, pattern, or @FILE that lists them"
+    )
+    p.add_argument("--out", required=True, metavar="ARCHIVE", help="make or continue this archive")
     p.add_argument(
         "--redo",
         action="append",
         default=[],
         choices=("failed", "changed", "all"),
-        help="do again what failed; what is of other content, parameters or version; all. May be repeated",
+        help="repeat failed runs, runs of other content, parameters or version, or all; may be given twice",
     )
-    p.add_argument("--namespace", help="namespace of the bags' topics (found by itself)")
-    p.add_argument("--start-from", choices=START_FROM, default="auto", help="as of run (default auto)")
-    p.add_argument("--spectrum-sign", type=int, choices=(1, -1), help="instead of what the bags state")
-    p.add_argument("--bags", action="store_true", help="write result.mcap of each (it holds every view)")
-    p.add_argument("--figures", action="store_true", help="draw the figures of each")
-    p.add_argument("--no-sync", action="store_true", help="leave writing out to the disk to the system")
+    p.add_argument("--namespace", help="namespace of the bags' topics (default: detect it)")
+    p.add_argument("--start-from", choices=START_FROM, default="auto", help="as for run (default auto)")
+    p.add_argument("--spectrum-sign", type=int, choices=(1, -1), help="use this sign instead of the bags'")
+    p.add_argument("--bags", action="store_true", help="write each run's result.mcap (it holds every view)")
+    p.add_argument("--figures", action="store_true", help="draw each run's figures")
+    p.add_argument("--no-sync", action="store_true", help="do not sync results to the disk")
     objects_option(p)
     group = p.add_argument_group("workers")
     group.add_argument(
-        "--workers", type=int, metavar="N", help="processes on this machine (default: one a processor)"
+        "--workers", type=int, metavar="N", help="run this many processes here (default: one per processor)"
     )
     group.add_argument(
-        "--threads", type=int, metavar="N", help="of each (default: processors are shared; on a cluster 1)"
+        "--threads",
+        type=int,
+        metavar="N",
+        help="give each worker this many threads (default: share the processors; on a cluster 1)",
     )
     group.add_argument(
         "--memory-gb",
         type=float,
         metavar="GB",
-        help="what each may take: a bag that needs more fails (default: 0.8 of the machine's memory, shared)",
+        help="limit each worker's memory: a bag that needs more fails (default: share 0.8 of the machine's)",
     )
     group.add_argument(
-        "--scheduler", metavar="ADDRESS", help="of a dask.distributed cluster, tcp://HOST:PORT"
+        "--scheduler", metavar="ADDRESS", help="use this dask.distributed scheduler, tcp://HOST:PORT"
     )
-    group.add_argument("--scheduler-file", metavar="FILE", help="the file that its scheduler wrote")
+    group.add_argument(
+        "--scheduler-file", metavar="FILE", help="find the scheduler by the file that it wrote"
+    )
     parameter_options(p)
     output_options(p)
 

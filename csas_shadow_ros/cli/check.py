@@ -13,15 +13,15 @@ def add_check(add: Callable[..., argparse.ArgumentParser]) -> None:
     """Add ``check``."""
     check = add(
         "check",
-        "say whether a bag can be processed or a results folder is whole, and what is wrong with it",
+        "check that a bag can be processed or that a results folder is whole, and list the faults",
         "  csas-shadow check box_run\n  csas-shadow check box_run --json > report.json\n"
         "  csas-shadow check box_results\n\n"
-        "exit code 1 if the bag does not honour the topic contract, or if files of the results folder are\n"
+        "Exit code 1 if the bag breaks the topic contract, or if files of the results folder are\n"
         "missing, changed or not listed.",
         _check,
     )
     check.add_argument("bag", metavar="BAG|DIR", help="rosbag2 directory, .mcap or .db3 file; or results")
-    check.add_argument("--namespace", help="namespace of its topics (found by itself)")
+    check.add_argument("--namespace", help="namespace of its topics (default: detect it)")
     run_option(check)
     output_options(check)
 

@@ -16,24 +16,26 @@ def add_import(add: Callable[..., argparse.ArgumentParser]) -> None:
     """Add ``import``."""
     p = add(
         "import",
-        "make a run's bag of an image and navigation that other programs wrote",
+        "make a run's bag from an image and navigation of other programs",
         "  csas-shadow import image.npy --out my_run --geometry geometry.yaml\n"
         "  csas-shadow import image.tif --out my_run --geometry geometry.yaml --track mission.mcap\n\n"
         "SOURCE is a complex image (.npy .npz .mat .h5 .tif .ntf), the track a CSV file or a bag with\n"
-        "Odometry, poses, fixes or transforms. docs/import.md tells of the page of geometry.",
+        "Odometry, poses, fixes or transforms. docs/import.md describes the page of geometry.",
         _import,
     )
     p.add_argument("source", metavar="SOURCE", help="the full-circle complex image")
-    p.add_argument("--out", required=True, metavar="BAG", help="rosbag2 directory to make")
-    p.add_argument("--geometry", required=True, metavar="YAML", help="what the image does not say of itself")
-    p.add_argument("--track", metavar="FILE|BAG", help="navigation, instead of the one that the page names")
+    p.add_argument("--out", required=True, metavar="BAG", help="make this rosbag2 directory")
+    p.add_argument(
+        "--geometry", required=True, metavar="YAML", help="read what the image does not say from this page"
+    )
+    p.add_argument("--track", metavar="FILE|BAG", help="read navigation from here instead of the page's file")
     p.add_argument(
         "--encoding",
         default="32FC2",
         choices=("32FC2", "64FC2", "16SC2", "8SC2"),
-        help="of the image in the bag (default 32FC2)",
+        help="encode the bag's image in this way (default 32FC2)",
     )
-    p.add_argument("--overwrite", action="store_true", help="replace a bag that is there")
+    p.add_argument("--overwrite", action="store_true", help="replace an existing bag")
     output_options(p)
 
 
@@ -45,8 +47,8 @@ def add_export(add: Callable[..., argparse.ArgumentParser]) -> None:
         "  csas-shadow export box_results --out box_maps\n"
         "  csas-shadow export box_results --out box_maps --format geotiff,gpkg --overwrite\n"
         "  csas-shadow export box_results --out box_maps --origin-lat-deg 48.38 --origin-lon-deg -4.49\n\n"
-        "without --format all that the run can be written in; what it lacks is told. With it, what the run\n"
-        "lacks makes exit code 3. docs/maps.md says what is in the files.",
+        "Without --format writes all formats that the run allows, and names what it lacks. With --format,\n"
+        "anything missing makes exit code 3. docs/maps.md describes the files.",
         _export,
         _export_options,
     )
@@ -54,14 +56,14 @@ def add_export(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 def _export_options(p: argparse.ArgumentParser) -> None:
     p.add_argument("result", metavar="RESULT", help="a results folder")
-    p.add_argument("--out", required=True, metavar="FOLDER", help="folder to make")
+    p.add_argument("--out", required=True, metavar="FOLDER", help="make this folder")
     p.add_argument(
         "--format",
         default="",
         metavar="LIST",
-        help="of geotiff, geojson, gpkg, kml, zarr, netcdf, with commas (default: all that can be)",
+        help="comma-separated: geotiff, geojson, gpkg, kml, zarr, netcdf (default: all possible ones)",
     )
-    p.add_argument("--overwrite", action="store_true", help="replace a folder of maps that is there")
+    p.add_argument("--overwrite", action="store_true", help="replace an existing folder of maps")
     add_parameters(p, {"place": STAGES["place"]})
     output_options(p)
 

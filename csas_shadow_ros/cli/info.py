@@ -14,12 +14,12 @@ def add_info(add: Callable[..., argparse.ArgumentParser]) -> None:
     """Add ``info``."""
     info = add(
         "info",
-        "tell what a bag or a results folder holds",
+        "list the contents of a bag or a results folder",
         "  csas-shadow info box_run\n  csas-shadow info box_results",
         _info,
     )
     info.add_argument("path", metavar="BAG|DIR", help="a bag, or a results folder")
-    info.add_argument("--namespace", help="namespace of the bag's topics (found by itself)")
+    info.add_argument("--namespace", help="namespace of the bag's topics (default: detect it)")
     output_options(info)
 
 

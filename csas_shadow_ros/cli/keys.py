@@ -19,13 +19,15 @@ def add_keys(add: Callable[..., argparse.ArgumentParser]) -> None:
         "  export ROS_SECURITY_KEYSTORE=$PWD/keystore\n"
         "  export ROS_SECURITY_ENABLE=true ROS_SECURITY_STRATEGY=Enforce\n"
         "  ros2 launch csas_shadow_ros csas_shadow.launch.py domain_id:=7\n\n"
-        "Needs the extra security. Keys are not replaced: renew them in a new folder.",
+        "Needs the extra security. Never replaces keys: renew them in a new folder.",
         _keys,
     )
     keys.add_argument("keystore", metavar="DIR", help="folder to make")
     keys.add_argument("--namespace", default="csas", help="namespace of the graph (default csas)")
     keys.add_argument("--domain-id", type=int, default=0, metavar="N", help="ROS domain (default 0)")
-    keys.add_argument("--days", type=int, default=365, metavar="N", help="how long they last (default 365)")
+    keys.add_argument(
+        "--days", type=int, default=365, metavar="N", help="days until the keys expire (default 365)"
+    )
     output_options(keys)
 
 

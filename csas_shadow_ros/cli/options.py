@@ -15,9 +15,9 @@ ALL_RUNS = "all"
 def output_options(parser: argparse.ArgumentParser) -> None:
     """Add what every command has: JSON, quiet, tracebacks."""
     group = parser.add_argument_group("output")
-    group.add_argument("--json", action="store_true", help="JSON alone on stdout")
-    group.add_argument("-q", "--quiet", action="store_true", help="no progress and no notices")
-    group.add_argument("--debug", action="store_true", help="tracebacks of errors")
+    group.add_argument("--json", action="store_true", help="print only JSON on stdout")
+    group.add_argument("-q", "--quiet", action="store_true", help="print no progress and no notices")
+    group.add_argument("--debug", action="store_true", help="print tracebacks of errors")
 
 
 def _number_help(field: dataclasses.Field[Any]) -> str:
@@ -88,7 +88,7 @@ def parameters_of(arguments: argparse.Namespace) -> PipelineParameters:
 def bag_argument(p: argparse.ArgumentParser) -> None:
     """Add the bag, and the namespace of its topics."""
     p.add_argument("bag", metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
-    p.add_argument("--namespace", help="namespace of its topics (found by itself)")
+    p.add_argument("--namespace", help="namespace of its topics (default: detect it)")
 
 
 def start_option(p: argparse.ArgumentParser) -> None:
@@ -97,7 +97,7 @@ def start_option(p: argparse.ArgumentParser) -> None:
         "--start-from",
         choices=START_FROM,
         default="auto",
-        help="image (or sectors) and track, or views of a stage; auto: the first that the bag holds",
+        help="start from image (or sectors) and track, or from views of a stage; auto: the first in the bag",
     )
 
 
@@ -108,8 +108,8 @@ def run_option(parser: argparse.ArgumentParser, *, each: bool = False) -> None:
         "--run",
         type=_run_or_all if each else int,
         metavar="N",
-        help="which of the bag's runs: its number in time from 1, or its name, the stamp (ns) of its track's"
-        f" first pose{every} (the first one that has an image or sectors)",
+        help="take this run of the bag: its number in time from 1, or its name, the stamp (ns) of its track's"
+        f" first pose{every} (default: the first with an image or sectors)",
     )
 
 
@@ -126,7 +126,7 @@ def objects_option(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=MAX_OBJECTS,
         metavar="N",
-        help="bodies of a scene that are carved, the target among them; the target's result does not depend"
+        help="carve at most this many bodies, including the target; the target's result does not depend"
         f" on it (1 to {MOST_OBJECTS}; default {MAX_OBJECTS})",
     )
 
@@ -134,14 +134,14 @@ def objects_option(parser: argparse.ArgumentParser) -> None:
 def results_options(parser: argparse.ArgumentParser) -> None:
     """Add what a results folder is made by."""
     group = parser.add_argument_group("results")
-    group.add_argument("--out", required=True, metavar="DIR", help="results folder to make")
-    group.add_argument("--overwrite", action="store_true", help="replace a results folder that is there")
-    group.add_argument("--no-bag", action="store_true", help="no result.mcap (it holds every view)")
-    group.add_argument("--no-figures", action="store_true", help="no figures/")
+    group.add_argument("--out", required=True, metavar="DIR", help="make this results folder")
+    group.add_argument("--overwrite", action="store_true", help="replace an existing results folder")
+    group.add_argument("--no-bag", action="store_true", help="write no result.mcap (it holds every view)")
+    group.add_argument("--no-figures", action="store_true", help="draw no figures/")
     group.add_argument(
         "--no-sync",
         action="store_true",
-        help="leave writing out to the disk to the system: a power cut may cost it",
+        help="do not sync the results to the disk: a power cut may lose them",
     )
 
 
@@ -149,9 +149,9 @@ def expect_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--expect`` and ``--junit``."""
     group = parser.add_argument_group("continuous integration (docs/replay_in_ci.md)")
     group.add_argument(
-        "--expect", metavar="YAML", help="values that the report must have; the exit code is 4 if it has not"
+        "--expect", metavar="YAML", help="compare the report with these values; exit with 4 if they differ"
     )
-    group.add_argument("--junit", metavar="FILE", help="write what became of them as JUnit XML")
+    group.add_argument("--junit", metavar="FILE", help="write the comparison as JUnit XML")
 
 
 def parameter_options(parser: argparse.ArgumentParser) -> None:
@@ -159,6 +159,6 @@ def parameter_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--params",
         metavar="YAML",
-        help="parameter file in ROS 2's layout, as config/csas_shadow.yaml; options override it",
+        help="read this parameter file in ROS 2's layout, as config/csas_shadow.yaml; options override it",
     )
     add_parameters(parser, dict(STAGES))

@@ -45,18 +45,18 @@ def _replay_options(p: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0,
         metavar="R",
-        help="views: times the recorded speed; 0: as fast as the nodes take them (default 0)",
+        help="play views at this multiple of the recorded speed; 0: as fast as nodes take them (default 0)",
     )
     p.add_argument(
         "--domain-id",
         type=int,
         metavar="N",
-        help="ROS domain, to look on: ROS_DOMAIN_ID=N ros2 topic list (default: one that nobody uses)",
+        help="use this ROS domain; watch with ROS_DOMAIN_ID=N ros2 topic list (default: a free one)",
     )
     p.add_argument(
-        "--view", action="store_true", help="open the operator's page beside it; it stays until Ctrl-C"
+        "--view", action="store_true", help="open the operator's page beside the run; it stays until Ctrl-C"
     )
-    p.add_argument("--no-browser", action="store_true", help="with --view: only print the address")
+    p.add_argument("--no-browser", action="store_true", help="with --view: only print the page's address")
     run_option(p, each=True)
     objects_option(p)
     results_options(p)

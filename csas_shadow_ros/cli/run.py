@@ -35,8 +35,8 @@ def add_run(add: Callable[..., argparse.ArgumentParser]) -> None:
         "  csas-shadow run views --out carved --start-from likelihood --method soft --target given \\\n"
         "      --size-m 2 2 0.8\n\n"
         "DIR holds grid.npz, mesh.stl .ply .obj .glb, report.json, summary.txt, result.mcap and figures/,\n"
-        "and object_2.npz, object_2.stl and so on of what else stands on the seabed.\n"
-        "A seabed without an object is a result like any other: it is said so, and the exit code is 0.",
+        "and object_2.npz, object_2.stl and so on for further objects on the seabed.\n"
+        "A seabed without an object is a valid result: the summary says so, and the exit code is 0.",
         _run,
         _run_options,
     )
@@ -51,9 +51,9 @@ def _run_options(p: argparse.ArgumentParser) -> None:
         type=int,
         choices=(1, -1),
         default=None,
-        help="instead of the one that the bag states",
+        help="use this sign instead of the bag's",
     )
-    p.add_argument("--workers", type=int, default=2, metavar="N", help="threads (default 2)")
+    p.add_argument("--workers", type=int, default=2, metavar="N", help="use this many threads (default 2)")
     objects_option(p)
     results_options(p)
     expect_options(p)

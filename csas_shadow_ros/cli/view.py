@@ -24,22 +24,24 @@ def add_view(add: Callable[..., argparse.ArgumentParser]) -> None:
         "  csas-shadow view box_results --html box.html --every 5\n"
         "  csas-shadow view monday_results friday_results\n"
         "  csas-shadow view season\n\n"
-        "ends with Ctrl-C. Listens on this machine alone unless --host says otherwise; the network is asked\n"
-        "for the token that is then printed. For a live graph: ros2 run csas_shadow_ros viewer",
+        "Ends with Ctrl-C. Listens on this machine alone unless --host says otherwise; then it prints a\n"
+        "token that visitors must give. For a live graph: ros2 run csas_shadow_ros viewer",
         _view,
     )
-    p.add_argument("path", metavar="DIR|BAG", help="results, a bag that holds views, or an archive of batch")
+    p.add_argument("path", metavar="DIR|BAG", help="results, a bag with views, or an archive of batch")
     p.add_argument(
-        "compare", nargs="?", metavar="OTHER", help="a second run of the same contact, to compare it with"
+        "compare", nargs="?", metavar="OTHER", help="compare with this second run of the same contact"
     )
-    p.add_argument("--namespace", help="namespace of the bag's topics (found by itself)")
-    p.add_argument("--host", default="127.0.0.1", help="address to listen at (default 127.0.0.1)")
-    p.add_argument("--port", type=int, default=0, metavar="N", help="port (default: any that is free)")
-    p.add_argument("--token", help="token to ask for (default: none here, a new one on a network)")
+    p.add_argument("--namespace", help="namespace of the bag's topics (default: detect it)")
+    p.add_argument("--host", default="127.0.0.1", help="listen at this address (default 127.0.0.1)")
+    p.add_argument(
+        "--port", type=int, default=0, metavar="N", help="listen on this port (default: any free one)"
+    )
+    p.add_argument("--token", help="ask for this token (default: none here, a new one on a network)")
     p.add_argument("--no-browser", action="store_true", help="only print the address")
     p.add_argument("--html", metavar="FILE", help="write one HTML file that opens without a server, and end")
     p.add_argument(
-        "--every", type=int, default=2, metavar="N", help="of that file: every N-th view (default 2)"
+        "--every", type=int, default=2, metavar="N", help="put every N-th view into that file (default 2)"
     )
     p.add_argument("--gif", metavar="FILE", help="write the circle as a moving picture, and end")
     output_options(p)
@@ -52,13 +54,15 @@ def add_report(add: Callable[..., argparse.ArgumentParser]) -> None:
         "write one page on a contact: pictures, dimensions, position, judgement, damage",
         "  csas-shadow report box_results\n"
         "  csas-shadow report box_results --contact 2 --out second.html\n\n"
-        "A PDF or an HTML file, as the name ends. The judgement is what was kept in the viewer.",
+        "Writes a PDF or an HTML file by the name's ending. The judgement is the one kept in the viewer.",
         _report,
     )
-    p.add_argument("path", metavar="DIR|BAG", help="a results folder, or a bag that holds views")
-    p.add_argument("--namespace", help="namespace of the bag's topics (found by itself)")
-    p.add_argument("--out", metavar="FILE", help="file to write (default: NAME_report.pdf)")
-    p.add_argument("--contact", type=int, metavar="N", help="number of the contact (default: the first)")
+    p.add_argument("path", metavar="DIR|BAG", help="a results folder, or a bag with views")
+    p.add_argument("--namespace", help="namespace of the bag's topics (default: detect it)")
+    p.add_argument("--out", metavar="FILE", help="write this file (default: NAME_report.pdf)")
+    p.add_argument(
+        "--contact", type=int, metavar="N", help="report this contact, by number (default: the first)"
+    )
     output_options(p)
 
 

@@ -16,8 +16,8 @@ def add_warm(add: Callable[..., argparse.ArgumentParser]) -> None:
         "warm",
         "compile all kernels, which takes a minute, once for all users of this installation",
         "  csas-shadow warm\n\n"
-        "Kernels are kept in the package's folder, else in the user's cache, else in the temporary folder:\n"
-        "the first that can be written, or NUMBA_CACHE_DIR. Run it as whoever installs, on the machine\n"
+        "Keeps kernels in the first writable of the package's folder, the user's cache and the temporary\n"
+        "folder, or in NUMBA_CACHE_DIR. Run it as the user who installs, on the machine\n"
         "that will run the nodes, or on one with the same processor.",
         _warm,
     )

@@ -145,24 +145,35 @@ MOST_OBJECTS = 64
 class SubApertureParameters(Parameters):
     """Sub-aperture generation (section 3.1)."""
 
-    aperture_deg: float = bounded(12.0, "full width of a sub-aperture", low=0.5, high=90.0, unit="deg")
-    step_deg: float = bounded(1.0, "aspect step between views; divides 360", low=0.1, high=90.0, unit="deg")
+    aperture_deg: float = bounded(
+        12.0, "set the full width of a sub-aperture", low=0.5, high=90.0, unit="deg"
+    )
+    step_deg: float = bounded(
+        1.0, "step the aspect between views by this; divides 360", low=0.1, high=90.0, unit="deg"
+    )
     taper: Taper = bounded(
-        "none", "window over the aperture ('none' is the paper's)", choices=get_args(Taper)
+        "none", "weight the aperture with this window ('none' is the paper's)", choices=get_args(Taper)
     )
     oversampling: float = bounded(
-        1.5, "view pixels per resolution cell of the wedge's bandwidth", low=1.0, high=8.0
+        1.5,
+        "sample views with this many pixels per resolution cell of the wedge's bandwidth",
+        low=1.0,
+        high=8.0,
     )
     spacing_m: float = bounded(
-        0.0, "pixel of the views; 0: from the wedge's bandwidth", low=0.0, high=100.0, unit="m"
+        0.0, "set the views' pixel; 0: derive it from the wedge's bandwidth", low=0.0, high=100.0, unit="m"
     )
     extent_m: float = bounded(
-        0.0, "side of the square views; 0: whole image at every aspect", low=0.0, high=1e5, unit="m"
+        0.0,
+        "set the side of the square views; 0: show the whole image at every aspect",
+        low=0.0,
+        high=1e5,
+        unit="m",
     )
     min_coverage: float = bounded(
-        0.75, "least fraction of the aperture that the track must cover", low=0.0, high=1.0
+        0.75, "make a view only if the track covers at least this fraction of its aperture", low=0.0, high=1.0
     )
-    check_sign: bool = bounded(True, "refuse an image whose shadows contradict its spectrum sign")
+    check_sign: bool = bounded(True, "refuse an image if its shadows contradict its spectrum sign")
 
 
 @dataclass(frozen=True)
@@ -170,7 +181,9 @@ class ShadowParameters(Parameters):
     """Shadow enhancement, FFSE (section 3.2)."""
 
     enhancement: Enhancement = bounded(
-        "exact", "filter: exact, the paper's simplified one, or none", choices=get_args(Enhancement)
+        "exact",
+        "choose the filter: exact, the paper's simplified one, or none",
+        choices=get_args(Enhancement),
     )
 
 
@@ -179,24 +192,30 @@ class LikelihoodParameters(Parameters):
     """Likelihood of a pixel being outside the shadow (section 4.2) and shadow segmentation."""
 
     background: Background = bounded(
-        "local", "seabed level: one a view, or a smooth surface", choices=get_args(Background)
+        "local",
+        "estimate the seabed level as a smooth surface (local) or one value per view (global)",
+        choices=get_args(Background),
     )
     shadow_level: ShadowLevel = bounded(
-        "estimated", "shadow level: measured, or from the contrast", choices=get_args(ShadowLevel)
+        "estimated", "measure the shadow level, or derive it from the contrast", choices=get_args(ShadowLevel)
     )
     shadow_contrast_db: float = bounded(
-        12.0, "seabed over shadow level; start of the estimate", low=1.0, high=60.0, unit="dB"
+        12.0, "start the estimate with this ratio of seabed to shadow level", low=1.0, high=60.0, unit="dB"
     )
     smoothing_m: float = bounded(
         0.0,
-        "multi-look smoothing before the likelihood; 0: none, as in the paper",
+        "average over this width before the likelihood; 0: do not, as in the paper",
         low=0.0,
         high=10.0,
         unit="m",
     )
-    echo_unknown: bool = bounded(True, "target echo knows nothing (NaN) instead of outside")
+    echo_unknown: bool = bounded(True, "read a target's echo as unknown (NaN) instead of outside")
     echo_db: float = bounded(
-        8.0, "echo: smoothed intensity above the seabed by", low=1.0, high=60.0, unit="dB"
+        8.0,
+        "call a pixel echo if its smoothed intensity exceeds the seabed by this",
+        low=1.0,
+        high=60.0,
+        unit="dB",
     )
 
 
@@ -206,20 +225,20 @@ class CarvingParameters(Parameters):
 
     method: Method = bounded(
         "consensus",
-        "consensus: silhouettes, few views may contradict; hard: none may; soft: mean likelihood",
+        "carve by silhouettes that few (consensus) or no views (hard) contradict, or by mean l_out (soft)",
         choices=get_args(Method),
     )
-    voxel_size_m: float = bounded(0.02, "edge of a voxel", low=1e-4, high=1e3, unit="m")
+    voxel_size_m: float = bounded(0.02, "set the edge of a voxel", low=1e-4, high=1e3, unit="m")
     threshold: float = bounded(
         0.0,
-        "object where the mean l_out (silhouettes: the contradicting fraction of the views) is below this;"
-        " 0: automatic",
+        "call a voxel object if its mean l_out (silhouettes: contradicting share of views) is below this;"
+        " 0: choose automatically",
         low=0.0,
         high=1.0,
     )
     min_views_fraction: float = bounded(
         0.25,
-        "a voxel seen by a smaller fraction of the views is unknown (consensus: object only on top of some)",
+        "call a voxel unknown if fewer of the views see it (consensus: object only if it stands on some)",
         low=0.0,
         high=1.0,
     )
@@ -236,17 +255,17 @@ class CarvingParameters(Parameters):
 
 @dataclass(frozen=True)
 class TargetParameters(Parameters):
-    """Where the target is and how large a volume is carved."""
+    """Target position and size of the carved volume."""
 
     target: TargetChoice = bounded(
-        "auto", "auto: find it; given: at position_m", choices=get_args(TargetChoice)
+        "auto", "find the target (auto), or carve at position_m (given)", choices=get_args(TargetChoice)
     )
     position_m: tuple[float, ...] = bounded(
-        (0.0, 0.0), "x, y of the target when given", low=-1e6, high=1e6, unit="m", length=2
+        (0.0, 0.0), "set x, y of a given target", low=-1e6, high=1e6, unit="m", length=2
     )
     size_m: tuple[float, ...] = bounded(
         (0.0, 0.0, 0.0),
-        "x, y, z size of the carved volume; 0: automatic",
+        "set the x, y, z size of the carved volume; 0: choose automatically",
         low=0.0,
         high=1e5,
         unit="m",
@@ -262,17 +281,22 @@ START_FROM: tuple[StartFrom, ...] = get_args(StartFrom)
 
 @dataclass(frozen=True)
 class PlaceParameters(Parameters):
-    """Where on earth the scene is: a datum, instead of topic origin."""
+    """Place on earth: a datum, instead of topic origin."""
 
     origin_lat_deg: float = bounded(
-        math.nan, "latitude of the scene's origin, WGS-84", low=-90.0, high=90.0, unit="deg", optional=True
+        math.nan,
+        "set the latitude of the scene's origin, WGS-84",
+        low=-90.0,
+        high=90.0,
+        unit="deg",
+        optional=True,
     )
     origin_lon_deg: float = bounded(
-        math.nan, "longitude of the scene's origin", low=-180.0, high=360.0, unit="deg", optional=True
+        math.nan, "set the longitude of the scene's origin", low=-180.0, high=360.0, unit="deg", optional=True
     )
     origin_heading_deg: float = bounded(
         math.nan,
-        "true bearing of the scene's y axis, clockwise; none: north",
+        "set the true bearing of the scene's y axis, clockwise; none: north",
         low=-360.0,
         high=360.0,
         unit="deg",
@@ -280,7 +304,7 @@ class PlaceParameters(Parameters):
     )
     origin_sigma_m: float = bounded(
         math.nan,
-        "standard deviation of that origin, along east and north",
+        "state the standard deviation of that origin, along east and north",
         low=0.0,
         high=1e5,
         unit="m",

@@ -33,33 +33,33 @@ P = TypeVar("P", bound=Parameters)
 
 @dataclass(frozen=True)
 class NodeParameters(Parameters):
-    """What every node takes."""
+    """Parameters of every node."""
 
-    autostart: bool = bounded(True, "configure and activate at once; false: wait for a lifecycle manager")
-    scene_frame: str = bounded("", "frame that all messages of a run must be in; empty: any one")
+    autostart: bool = bounded(True, "configure and activate on start; false: wait for a lifecycle manager")
+    scene_frame: str = bounded("", "accept only messages in this frame; empty: any single frame")
 
 
 @dataclass(frozen=True)
 class FlowParameters(Parameters):
-    """What every source of views takes."""
+    """Parameters of every source of views."""
 
-    window: int = bounded(4, "views that may be on their way at once", low=1, high=8)
+    window: int = bounded(4, "keep at most this many views in flight", low=1, high=8)
     resend_s: float = bounded(
-        5.0, "a view of which nothing is heard is sent again after", low=0.1, high=600.0, unit="s"
+        5.0, "resend a view if unacknowledged for this long", low=0.1, high=600.0, unit="s"
     )
     sink_wait_s: float = bounded(
-        60.0, "how long a consumer that is not there is waited for", low=0.0, high=86400.0, unit="s"
+        60.0, "wait this long for a missing consumer", low=0.0, high=86400.0, unit="s"
     )
-    min_sinks: int = bounded(0, "no view is sent before so many sinks are there", low=0, high=16)
+    min_sinks: int = bounded(0, "wait for this many sinks before sending the first view", low=0, high=16)
 
 
 @dataclass(frozen=True)
 class SnapshotParameters(Parameters):
-    """What nodes take that show their result while it grows."""
+    """Parameters of nodes that publish a growing result."""
 
     publish_hz: float = bounded(
         1.0,
-        "most often that an unfinished result is published; 0: the end result alone",
+        "publish an unfinished result at most this often; 0: publish only the final one",
         low=0.0,
         high=20.0,
         unit="Hz",
@@ -70,9 +70,13 @@ class SnapshotParameters(Parameters):
 class FocusParameters(Parameters):
     """Where shadows are focused."""
 
-    target: str = bounded("auto", "auto: from topic target; given: at position_m", choices=("auto", "given"))
+    target: str = bounded(
+        "auto",
+        "take the target from topic target (auto) or from position_m (given)",
+        choices=("auto", "given"),
+    )
     position_m: tuple[float, ...] = bounded(
-        (0.0, 0.0), "x, y of the target when given", low=-1e6, high=1e6, unit="m", length=2
+        (0.0, 0.0), "set x, y of a given target", low=-1e6, high=1e6, unit="m", length=2
     )
 
 
@@ -81,13 +85,15 @@ class BoxParameters(Parameters):
     """Where the target is and how large it is, for nodes behind the one that finds it."""
 
     target: str = bounded(
-        "auto", "auto: from topic target; given: position_m and size_m", choices=("auto", "given")
+        "auto",
+        "take the target from topic target (auto) or from position_m and size_m (given)",
+        choices=("auto", "given"),
     )
     position_m: tuple[float, ...] = bounded(
-        (0.0, 0.0), "x, y of the target when given", low=-1e6, high=1e6, unit="m", length=2
+        (0.0, 0.0), "set x, y of a given target", low=-1e6, high=1e6, unit="m", length=2
     )
     size_m: tuple[float, ...] = bounded(
-        (0.0, 0.0, 0.0), "x, y, z size of the carved volume when given", low=0.0, high=1e5, unit="m", length=3
+        (0.0, 0.0, 0.0), "set the x, y, z size of a given volume", low=0.0, high=1e5, unit="m", length=3
     )
 
 
@@ -97,13 +103,13 @@ class SubApertureNodeParameters(NodeParameters, FlowParameters, TargetParameters
 
     first_search_deg: float = bounded(
         120.0,
-        "sectors: a target is looked for once they cover so much; 360: not before the circle is closed",
+        "search for a target once sectors cover this arc; 360: wait for the closed circle",
         low=30.0,
         high=360.0,
         unit="deg",
     )
     max_objects: int = bounded(
-        MAX_OBJECTS, "bodies that are carved at most, the target among them", low=1, high=MOST_OBJECTS
+        MAX_OBJECTS, "carve at most this many bodies, including the target", low=1, high=MOST_OBJECTS
     )
 
 
@@ -130,21 +136,27 @@ class VoxelCarverNodeParameters(
     """Parameters of `voxel_carver`; those of earlier stages measure the target and make further bodies."""
 
     parent_frame: str = bounded(
-        "earth", "frame that scene_transform leads to: earth (REP 105), or an east-north-up one, such as map"
+        "earth",
+        "publish scene_transform into this frame: earth (REP 105) or an east-north-up one, such as map",
     )
     parent_lat_deg: float = bounded(
         math.nan,
-        "latitude of that frame's origin; none: the scene's",
+        "set the latitude of that frame's origin; none: the scene's",
         low=-90.0,
         high=90.0,
         unit="deg",
         optional=True,
     )
     parent_lon_deg: float = bounded(
-        math.nan, "its longitude", low=-180.0, high=360.0, unit="deg", optional=True
+        math.nan,
+        "set the longitude of that frame's origin",
+        low=-180.0,
+        high=360.0,
+        unit="deg",
+        optional=True,
     )
     compare: bool = bounded(
-        True, "carve by the other method too, on other_method/*; it finds what is too thin for silhouettes"
+        True, "also carve by the other method, on other_method/*, to find objects too thin for silhouettes"
     )
 
     def check(self) -> None:
@@ -159,7 +171,7 @@ class CompositesNodeParameters(NodeParameters, SnapshotParameters):
     """Parameters of `composites`."""
 
     dynamic_range_db: float = bounded(
-        35.0, "levels shown in colour by aspect", low=1.0, high=200.0, unit="dB"
+        35.0, "show this range of levels in colour by aspect", low=1.0, high=200.0, unit="dB"
     )
 
 
@@ -167,25 +179,28 @@ class CompositesNodeParameters(NodeParameters, SnapshotParameters):
 class BagPlayerNodeParameters(NodeParameters, FlowParameters):
     """Parameters of `bag_player`."""
 
-    bag: str = bounded("", "bag to play: a rosbag2 directory, or an .mcap or .db3 file")
-    bag_namespace: str = bounded("", "namespace of the bag's topics; empty: found by itself")
+    bag: str = bounded("", "play this bag: a rosbag2 directory, or an .mcap or .db3 file")
+    bag_namespace: str = bounded("", "read the bag's topics in this namespace; empty: detect it")
     stage: str = bounded(
         "auto",
-        "what to play; auto: the earliest that the bag holds whole",
+        "play this stage; auto: the earliest that is complete in the bag",
         choices=("auto", "image", "sector", "sub_aperture", "shadow", "likelihood", "shadow_mask"),
     )
     run: int = bounded(
         0,
-        "which of the bag's runs: its number from 1, or its name (stamp of its first pose, ns); 0: the first",
+        "play this run of the bag: number from 1, or name (stamp of its first pose, ns); 0: the first",
         low=0,
         high=1 << 62,
     )
     rate: float = bounded(
-        1.0, "views: times the recorded speed; 0: as fast as they are taken", low=0.0, high=1e6
+        1.0,
+        "play views at this multiple of the recorded speed; 0: as fast as consumers take them",
+        low=0.0,
+        high=1e6,
     )
     clock_hz: float = bounded(
         0.0,
-        "publish /clock so often: the time when what is played was recorded; 0: not",
+        "publish /clock, the recording's time, at this rate; 0: do not",
         low=0.0,
         high=1000.0,
         unit="Hz",
@@ -196,25 +211,25 @@ class BagPlayerNodeParameters(NodeParameters, FlowParameters):
 class BagRecorderNodeParameters(NodeParameters):
     """Parameters of `bag_recorder`."""
 
-    out: str = bounded("", "bag to make: a directory that does not exist yet")
-    resume: bool = bounded(False, "go on with a recording that is there already, instead of refusing it")
+    out: str = bounded("", "record to this new directory")
+    resume: bool = bounded(False, "continue an existing recording instead of refusing it")
     compress: bool = bounded(True, "compress the bag")
     compression: str = bounded(
-        "zstd", "zstd; lz4: a tenth larger, four times as fast", choices=("zstd", "lz4")
+        "zstd", "compress by zstd, or by lz4: a tenth larger, four times as fast", choices=("zstd", "lz4")
     )
-    sync: bool = bounded(True, "write a bag out to the disk at its end, so that a power cut does not cost it")
-    topics: str = bounded("all", "topics to record, relative, separated by commas; all: the whole contract")
+    sync: bool = bounded(True, "sync a finished bag to the disk, to survive a power cut")
+    topics: str = bounded("all", "record these topics, relative, comma-separated; all: the whole contract")
 
 
 @dataclass(frozen=True)
 class ViewerNodeParameters(NodeParameters):
     """Parameters of `viewer`."""
 
-    host: str = bounded("127.0.0.1", "address to listen at; not a loopback one: a token is asked for")
-    port: int = bounded(8765, "port of the page; 0: any that is free", low=0, high=65535)
-    token: str = bounded("auto", "token to ask for; auto: none on this machine, a new one on a network")
+    host: str = bounded("127.0.0.1", "listen at this address; one that is not loopback requires a token")
+    port: int = bounded(8765, "serve the page on this port; 0: any free port", low=0, high=65535)
+    token: str = bounded("auto", "ask for this token; auto: none on this machine, a new one on a network")
     method: str = bounded(
-        "consensus", "method of voxel_carver, whose grid is shown", choices=("consensus", "hard", "soft")
+        "consensus", "show the grid of voxel_carver's method", choices=("consensus", "hard", "soft")
     )
 
 
