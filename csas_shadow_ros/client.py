@@ -239,7 +239,7 @@ class ViewSubscriber:
         topic = stream_of(self._stream).image_topic
         if age_s > _LONELY_S and not self._host.count_publishers(topic):
             name = self._host.node.resolve_topic_name(topic)
-            self._host.warn_once(f"nobody publishes {name}: the run waits for it as this node does")
+            self._host.warn_once(f"nobody publishes {name}: this node and the run wait for it")
 
 
 class _Host:

@@ -156,7 +156,7 @@ def read_expectations(path: str | Path) -> tuple[Expectation, ...]:
         reason = " ".join(str(error).split())
         raise ParameterError(f"file of expectations {str(path)!r} cannot be read: {reason}") from error
     if not isinstance(document, dict) or not document:
-        raise ParameterError(f"{path} is no mapping of names to expected values")
+        raise ParameterError(f"{path} is not a mapping of names to expected values")
     found = []
     for name, value in document.items():
         prefix, _, digits = str(name).rpartition("_")

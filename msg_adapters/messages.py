@@ -265,7 +265,7 @@ def _decoded(cdr: bytes | memoryview, type_name: str, where: str) -> Any:
     except (SerdeError, AssertionError, IndexError, OverflowError, MemoryError, ValueError) as error:
         # Also text that is no UTF-8, whose error quotes all of the text.
         reason = type(error).__name__ if isinstance(error, ValueError) else str(error)[:120] or "too short"
-        raise AdapterError(f"{where} is no {type_name}: {reason}") from error
+        raise AdapterError(f"{where} is not a {type_name}: {reason}") from error
 
 
 #: A Path of more is refused: 200 Hz, as fast as inertial navigation comes, over 83 minutes. At half of it
@@ -300,12 +300,12 @@ class PackedPath:
         self.table: tuple[NDArray[np.int64], NDArray[np.float64], str] | None = None
         body = self._cdr[4:]
         if len(body) < 16 or self._cdr[0] != 0 or self._cdr[1] > 1:
-            raise AdapterError(f"{where} is no {self.__msgtype__}: too short, or no plain CDR")
+            raise AdapterError(f"{where} is not a {self.__msgtype__}: too short, or not plain CDR")
         order = "<" if self._cdr[1] == 1 else ">"
         (length,) = struct.unpack_from(f"{order}I", body, 8)
         at = 12 + length + -length % 4
         if at + 4 > len(body):
-            raise AdapterError(f"{where} is no {self.__msgtype__}: too short")
+            raise AdapterError(f"{where} is not a {self.__msgtype__}: too short")
         (self.count,) = struct.unpack_from(f"{order}I", body, at)
         if self.count > MAX_POSES:
             raise AdapterError(f"{where} has {self.count} poses; expected at most {MAX_POSES}")
@@ -369,7 +369,7 @@ def _text(raw: memoryview, where: str) -> str:
     try:
         return bytes(raw[:-1]).decode()
     except UnicodeDecodeError:
-        raise AdapterError(f"{where} is no {PackedPath.__msgtype__}: a frame is no UTF-8") from None
+        raise AdapterError(f"{where} is not a {PackedPath.__msgtype__}: a frame is not UTF-8") from None
 
 
 def type_name_of(msg: Any) -> str:

@@ -69,7 +69,7 @@ class Summary:
     def __str__(self) -> str:
         parts = [f"{self.processed} of {self.bags} bags processed in {_span(self.seconds)}"]
         if self.known:
-            parts.append(f"{self.known} were there")
+            parts.append(f"{self.known} already done")
         if self.failed:
             parts.append(f"{self.failed} failed")
         text = "; ".join(parts)

@@ -313,7 +313,7 @@ def rebuild(root: str | Path, progress: Callable[[int], None] = lambda _: None) 
     """
     archive = Archive(root)
     if not archive.root.is_dir():
-        raise ArchiveError(f"{archive.root} is no folder; expected an archive")
+        raise ArchiveError(f"{archive.root} is not a folder; expected an archive")
     with archive.held():
         catalogue = Catalogue(archive)
         shutil.rmtree(archive.parts, ignore_errors=True)

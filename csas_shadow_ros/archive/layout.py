@@ -161,7 +161,7 @@ class Archive:
             return
         try:
             if self.root.exists() and (not self.root.is_dir() or any(self.root.iterdir())):
-                raise ArchiveError(f"{self.root} is there and is no archive; expected a new folder")
+                raise ArchiveError(f"{self.root} exists and is not an archive; expected a new folder")
             (self.root / RUNS).mkdir(parents=True, exist_ok=True)
             replace_text(self.root / ARCHIVE, json.dumps({"format": FORMAT}) + "\n")
         except OSError as error:

@@ -148,7 +148,7 @@ def content_of(bag: Path) -> str:
     for path in files:
         if not path.is_file():
             path.stat()  # says what is wrong where there is none
-            raise BagError(f"{path} is no file; expected a recording")
+            raise BagError(f"{path} is not a file; expected a recording")
         name = path.name if bag.is_dir() else path.name.removeprefix(bag.name)
         digest.update(f"{name}\0{sha256(path)}\0".encode("utf-8", "surrogateescape"))
     return digest.hexdigest()

@@ -310,7 +310,7 @@ class ClusterWorkers:
 
     def _gone(self) -> WorkersError:
         return WorkersError(
-            f"scheduler {self._where} is gone; what is done is kept, the same command goes on"
+            f"scheduler {self._where} is gone; finished bags are kept, the same command resumes"
         )
 
     def end(self, *, now: bool) -> None:  # noqa: ARG002  (as the local one has it)

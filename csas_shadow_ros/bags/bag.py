@@ -212,7 +212,7 @@ class BagReader:
             self._cut(f"{_unplaced(refused, self.path)}; its messages are lost")
         found = sum(sum(f.counts.values()) for f in self._files)
         if found < counted and not self._problems:
-            self._cut(f"{METADATA} tells of {counted} messages; the files hold {found}: the others are lost")
+            self._cut(f"{METADATA} lists {counted} messages; the files hold {found}: the others are lost")
 
     def _cut(self, problem: str) -> None:
         self.complete = False
@@ -234,7 +234,7 @@ class BagReader:
             elif found not in present:
                 present.append(found)
         if not present and not stored:
-            raise BagError(f"{self.path}: no storage file is there; expected {', '.join(names[:8]) or 'one'}")
+            raise BagError(f"{self.path}: no storage file found; expected {', '.join(names[:8]) or 'one'}")
         for name in lost:
             self._cut(f"{name}, listed in {METADATA}, is missing")
         known = {_bare(p.name) for p in present or stored}
@@ -261,7 +261,7 @@ class BagReader:
             if start == SQLITE_MAGIC:
                 return SqliteFile(source, self._complain, name)
             if start and not start.startswith(MAGIC) and ".db3" in path.suffixes:
-                raise BagError(f"cannot read {path}: it is no sqlite3 database (starts with {start[:8]!r})")
+                raise BagError(f"cannot read {path}: not a sqlite3 database (starts with {start[:8]!r})")
             return McapFile(source, self._complain, name)
         except BagError as error:
             raise BagError(str(error).replace(str(source), str(path))) from error
@@ -451,7 +451,7 @@ class BagWriter:
             raise BagError(f"{self.path} exists already; expected a new directory, or overwrite")
         inside = list(self.path.iterdir()) if self.path.is_dir() else None
         if inside is None or any(p.name != METADATA and p.suffix not in (".mcap", ".db3") for p in inside):
-            raise BagError(f"{self.path} is there and is no bag: not replaced")
+            raise BagError(f"{self.path} exists and is not a bag: not replaced")
         shutil.rmtree(self.path)
 
     def __enter__(self) -> BagWriter:

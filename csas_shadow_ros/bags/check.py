@@ -255,7 +255,7 @@ class _Check:
                 ERROR,
                 "",
                 line,
-                "Copy or record the bag again. Processed as it is, what could be read is used.",
+                "Copy or record the bag again. Otherwise processing uses the readable part.",
             )
         if not reader.has_checksums and reader.message_count:
             self.say(INFO, "", "parts of the bag carry no checksum: changed bits would go unnoticed")
@@ -297,7 +297,7 @@ class _Check:
         infos = [] if images else self.run_without_pixels(self.runs).sector_infos()
         self.track, notes = self.runs.track(images[0] if images else None, infos)
         for note in notes:
-            remedy = "Views are made from the poses that are left. Check that the circle is what was flown."
+            remedy = "Views use the remaining poses. Check that this is the circle that was flown."
             self.say(ERROR if self.track is None else WARNING, topic, note, remedy)
         if self.track is None:
             return
@@ -442,7 +442,7 @@ def judge_coverage(track: Track) -> Iterator[tuple[str, str, str]]:
     yield (
         WARNING,
         problem,
-        "No views are made in these arcs. Record the track round the whole circle if it was flown.",
+        "These arcs get no views. Record the track round the whole circle if it was flown.",
     )
 
 
@@ -508,7 +508,7 @@ def judge_sectors(run: Run, track: Track) -> Iterator[tuple[str, str, str]]:
                     f"sectors at {other.stamp_ns} ns and {info.stamp_ns} ns are of the same arc,"
                     f" {math.degrees(info.aperture_rad):g} degrees round {math.degrees(info.aspect_rad):.1f}:"
                     " it counts twice",
-                    "Give a sector that is sent again the stamp that it had: it then counts once.",
+                    "Resend a sector with its original stamp: it then counts once.",
                 )
 
 
@@ -634,7 +634,7 @@ def judge_stuck(image: CoherentImage) -> Iterator[tuple[str, str, str]]:
         f"the pixel in row {row[worst]}, column {col[worst]}{more} is {over:.0f} dB over the median, and"
         f" {STUCK_OVER_NEIGHBOURS_DB:.0f} dB or more over all round it, with {100 * share:.0f} % of all"
         f" energy: it is stuck, and its sidelobes lie over the shadows{used}",
-        "Set it to 0, or to what is round it: one pixel less changes no shadow.",
+        "Set it to 0, or to its neighbours' level: one pixel less changes no shadow.",
     )
 
 
@@ -799,5 +799,5 @@ def check_spectrum_sign(image: CoherentImage, track: Track) -> Iterator[tuple[st
             yield (
                 WARNING,
                 f"something stands at ({x + 0.0:.2f}, {y + 0.0:.2f}) m: {left.reason}",
-                "Process a larger scene: nothing can be said of a body whose shadows are not on the image.",
+                "Process a larger scene: a body with its shadows off the image cannot be judged.",
             )

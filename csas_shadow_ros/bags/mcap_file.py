@@ -76,7 +76,7 @@ class McapFile:
     Raises
     ------
     BagError
-        If it cannot be opened, is empty, or is no MCAP file.
+        If it cannot be opened, is empty, or is not an MCAP file.
     """
 
     def __init__(self, path: Path, complain: Callable[[str], None], name: str | None = None) -> None:
@@ -99,7 +99,7 @@ class McapFile:
                 if not magic:
                     raise BagError(f"{path} is empty (0 bytes); expected an MCAP file")
                 if magic != MAGIC:
-                    raise BagError(f"{path} is no MCAP file (starts with {magic!r}); expected {MAGIC!r}")
+                    raise BagError(f"{path} is not an MCAP file (starts with {magic!r}); expected {MAGIC!r}")
                 self.size = file.seek(0, io.SEEK_END)
                 if not self._read_summary(file):
                     self._scan(file)
@@ -121,7 +121,7 @@ class McapFile:
             return None  # written without a summary: not an error, the records are walked
         end = self.size - _FOOTER_BYTES
         if not len(MAGIC) <= start <= end:
-            self._cut_short(f"its summary is said to start at byte {start} of {self.size}")
+            self._cut_short(f"its summary should start at byte {start} of {self.size}")
             return None
         file.seek(start)
         summary = file.read(end - start)
@@ -181,7 +181,7 @@ class McapFile:
 
     def _cut_short(self, why: str) -> None:
         self.complete = False
-        self._complain(f"{self.name}: {why}; reading what is left of it")
+        self._complain(f"{self.name}: {why}; reading what remains of it")
 
     def _definition(self, op: int, body: memoryview) -> None:
         if op == _SCHEMA:

@@ -46,7 +46,7 @@ class _Loader(Composer, _Parser, SafeConstructor, Resolver):  # type: ignore[mis
         if self.check_event(yaml.AliasEvent):
             node = super().compose_node(parent, index)
             if id(node) not in self._size:
-                raise ComposerError(None, None, "an alias refers to what it is part of", mark)
+                raise ComposerError(None, None, "an alias contains itself", mark)
             size = self._size[id(node)]
         else:
             self._depth += 1

@@ -277,7 +277,7 @@ class Run:
             what = f"the stamps of {len(uncovered)} {stream_name} messages,"
             what += f" {min(uncovered)} to {max(uncovered)} ns"
             topic = absolute_name(stream(stream_name).image_topic, self.namespace)
-            self.report(Problem(topic, None, None, f"{self._runs.not_covered(what)}; they are passed over"))
+            self.report(Problem(topic, None, None, f"{self._runs.not_covered(what)}; they are skipped"))
 
     def report(self, problem: Problem) -> None:
         """Note a problem; the same one only once."""

@@ -87,7 +87,7 @@ class SqliteFile:
             if row is None:
                 raise ValueError(f"it has no table {table!r}; expected a rosbag2 recording")
             if row[0] != "table" or not str(row[1]).upper().startswith("CREATE TABLE"):
-                raise ValueError(f"{table!r} is no plain table; expected a rosbag2 recording")
+                raise ValueError(f"{table!r} is not a plain table; expected a rosbag2 recording")
             known = {r[1]: r[6] for r in connection.execute(f"PRAGMA table_xinfo({table})")}
             if lacking := [c for c in columns if known.get(c) != 0]:
                 raise ValueError(

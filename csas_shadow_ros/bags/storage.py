@@ -126,7 +126,7 @@ def unfold(data: memoryview, compression: str, size: int) -> memoryview:
         if compression == "zstd":
             # The frame's own word for its size is what the library would allocate.
             if (own := zstandard.frame_content_size(data)) not in (size, -1):
-                raise ValueError(f"chunk is said to unfold to {size} bytes and to {own}")
+                raise ValueError(f"chunk declares {size} bytes unfolded, its frame {own}")
             return memoryview(zstandard.ZstdDecompressor().decompress(data, max_output_size=max(size, 1)))
         if compression == "lz4":
             stream = lz4.frame.LZ4FrameDecompressor()
@@ -134,7 +134,7 @@ def unfold(data: memoryview, compression: str, size: int) -> memoryview:
             if not stream.eof and len(out) == size:
                 out += stream.decompress(b"", max_length=1)
             if len(out) > size or not stream.eof:
-                raise ValueError(f"chunk does not unfold to the {size} bytes that it is said to")
+                raise ValueError(f"chunk does not unfold to the {size} bytes that it declares")
             return memoryview(out)
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
         raise ValueError(f"chunk cannot be decompressed ({error})") from error
@@ -188,7 +188,7 @@ def unfold_file(path: Path, compression: str, into: Path, complain: Callable[[st
         except OSError as error:
             raise BagError(f"cannot decompress {path} to {into.parent}: {error.strerror}") from error
         except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
-            complain(f"{path.name}: cannot be decompressed to its end ({error}); reading what is left of it")
+            complain(f"{path.name}: cannot be decompressed to its end ({error}); reading what remains of it")
             return False
     return True
 

@@ -71,7 +71,7 @@ class BagRuns:
                     None,
                     None,
                     f"the bag holds {len(self.names)} runs, named by their first poses' stamps in ns: run"
-                    f" {number} ({self.name}) is looked at, not {others}; --run chooses another",
+                    f" {number} ({self.name}) is used, not {others}; --run chooses another",
                 )
             )
 

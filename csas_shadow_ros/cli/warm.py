@@ -42,6 +42,6 @@ def _warm(_: argparse.Namespace, console: Console) -> int:
         "place": place.kind,
         "folder": place.folder and str(place.folder),
     }
-    text = f"{compiled} kernels compiled, {loaded} were there; {seconds:.1f} s; kept: {place}"
+    text = f"{compiled} kernels compiled, {loaded} loaded; {seconds:.1f} s; kept: {place}"
     console.result(text, document)
     return OK

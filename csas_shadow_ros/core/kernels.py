@@ -124,11 +124,11 @@ def place() -> Place:
             continue
         if candidate.kind in ("user cache", "temporary folder"):
             if not known:
-                log.warning("compiled kernels are kept in %s: %s cannot be written", folder, package_folder())
+                log.warning("keeping compiled kernels in %s: %s is not writable", folder, package_folder())
             _bring(package_folder(), folder)
         return candidate
     log.warning(
-        "compiled kernels cannot be kept: no folder can be written; expected one of package, user cache "
+        "cannot keep compiled kernels: no folder is writable; expected one of package, user cache "
         "and temporary folder, or NUMBA_CACHE_DIR"
     )
     return Place("nowhere", None)

@@ -53,7 +53,7 @@ class ProcessedView:
     def require(self, part: str) -> Any:
         """Return a part, or raise a ViewError where what is there does not tell it."""
         if (made := getattr(self, part)) is None:
-            raise ViewError(f"a view's {part} cannot be made: what comes before it is not there")
+            raise ViewError(f"a view's {part} cannot be made: its input is missing")
         return made
 
     @cached_property

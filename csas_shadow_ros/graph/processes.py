@@ -87,7 +87,7 @@ def config_file(name: str) -> Path:
     for place in places:
         if place.is_file():
             return place
-    raise ReplayError(f"{name} is nowhere; expected it at one of: {', '.join(map(str, places))}")
+    raise ReplayError(f"{name} not found; expected it at one of: {', '.join(map(str, places))}")
 
 
 class DomainReservation:
@@ -118,7 +118,7 @@ class DomainReservation:
             held = bound(ports_of(domain_id)[0] + _HELD)
             if held is None:
                 raise ReplayError(
-                    f"ROS domain {domain_id} is taken by another replay on this machine (UDP port"
+                    f"ROS domain {domain_id} is held by another replay on this machine (UDP port"
                     f" {ports_of(domain_id)[0] + _HELD}); expected a domain of its own"
                 )
             self.domain_id, self._held, self._own = domain_id, held, False

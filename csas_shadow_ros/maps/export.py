@@ -135,4 +135,4 @@ def _check_place(folder: Path, overwrite: bool) -> None:
     except (OSError, ValueError, LookupError, TypeError):
         ours = False
     if not ours:
-        raise MapError(f"{folder} is there and is no folder of maps: not replaced")
+        raise MapError(f"{folder} exists and is not a folder of maps: not replaced")

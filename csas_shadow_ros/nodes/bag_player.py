@@ -153,7 +153,7 @@ class BagPlayerNode(CsasNode):
     def send_view(self, stamp: int) -> None:
         """Publish a view as it was recorded."""
         if self.views is None:
-            raise BagError(f"view {stamp} ns was asked for, but the bag's image is played")
+            raise BagError(f"view {stamp} ns requested, but the player plays the bag's image")
         image, info = self.views.get(stamp)
         if self._began is None:
             self._began = (time.monotonic(), self._schedule[stamp])

@@ -166,7 +166,7 @@ class BagRecorderNode(CsasNode):
             # A recorder was killed here: its bag has no end. Or it was ended, and is to go on. What the bag
             # holds goes into the new one.
             if cut.exists():
-                raise BagError(f"{cut} and {path} are both unfinished; expected one of them at most")
+                raise BagError(f"{cut} and {path} are both unfinished; expected at most one")
             path.rename(cut)
         fast = self.parameters.compress and self.parameters.compression == "lz4"
         bag = RunBag(path, BagWriter(path, compress="lz4" if fast else self.parameters.compress))
@@ -179,7 +179,7 @@ class BagRecorderNode(CsasNode):
         try:
             reader = BagReader(cut)
         except BagError as error:
-            self.get_logger().warning(f"{error}; nothing of the unfinished recording can be used")
+            self.get_logger().warning(f"{error}; the unfinished recording is unusable")
             return
         namespace = absolute_name("", self.get_namespace()).rstrip("/")
         prefix = f"{namespace}/"
@@ -205,7 +205,7 @@ class BagRecorderNode(CsasNode):
                 sync_tree(bag.path)
         except (BagError, OSError) as error:
             self.unable = self.unable or str(error)
-            self.get_logger().error(f"{error}; what was written up to there can be read")
+            self.get_logger().error(f"{error}; data up to there are readable")
 
     # Which bag
 

@@ -37,7 +37,7 @@ def header_stamp(cdr: Any, where: str) -> int:
         If it is too short, no plain CDR, or its stamp is no time.
     """
     if len(cdr) < 12 or cdr[0] != 0 or cdr[1] > 1:
-        raise BagError(f"{where}: {bytes(cdr[:4])!r}… ({len(cdr)} bytes) is no CDR message with a header")
+        raise BagError(f"{where}: {bytes(cdr[:4])!r}… ({len(cdr)} bytes) is not a CDR message with a header")
     sec, nanosec = struct.unpack_from("<iI" if cdr[1] == 1 else ">iI", cdr, 4)
     if sec < 0 or nanosec >= NANOSECONDS:
         raise BagError(f"{where}: stamp is {sec} s {nanosec} ns; expected sec >= 0 and nanosec in [0, 1e9)")
@@ -55,7 +55,7 @@ def message_stamp(cdr: Any, topic: str) -> int | None:
     if topic_of(topic).type_name != MARKERS:
         return header_stamp(cdr, topic)
     if len(cdr) < 8 or cdr[0] != 0 or cdr[1] > 1:
-        raise BagError(f"{topic}: {bytes(cdr[:4])!r}… ({len(cdr)} bytes) is no CDR message")
+        raise BagError(f"{topic}: {bytes(cdr[:4])!r}… ({len(cdr)} bytes) is not a CDR message")
     (count,) = struct.unpack_from("<I" if cdr[1] == 1 else ">I", cdr, 4)
     # An array has no header of its own: its markers have.
     return header_stamp(bytes(cdr[:4]) + bytes(cdr[8:20]), topic) if count else None

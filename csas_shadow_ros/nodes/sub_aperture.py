@@ -47,7 +47,7 @@ from .runtime.runs import HOLD_S, RunFollower
 _IRREGULAR = {
     "repeated": "came again; it counts once",
     "out_of_order": "came after later ones; the result is the same",
-    "late": "came after views that it changes were made; all views are made again",
+    "late": "came after the views that it changes; all views are made again",
 }
 #: So long the search for the whole run's target waits at most for views that are due already.
 _DECIDE_S = 2.0
@@ -199,7 +199,7 @@ class SubApertureNode(CsasNode):
         if not reason:
             self.take_run_image(self.track.run_of(stamp), stamp, image, info)
         elif time.monotonic() - since_s > patience_s:
-            raise ViewError(f"image stamped {stamp} ns: {reason}; it is not used")
+            raise ViewError(f"image stamped {stamp} ns: {reason}; ignored")
         else:
             others = [held for held in self.unplaced if stamp_to_ns(held[1].header.stamp) != stamp]
             for _, given_up, _ in others[: 1 - _MOST_UNPLACED]:
@@ -222,8 +222,8 @@ class SubApertureNode(CsasNode):
             return
         if run.image_stamp is not None:
             raise ViewError(
-                f"image stamped {stamp} ns came during the run of {run.image_stamp} ns, which is the same run"
-                " by its track; it is not used"
+                f"image stamped {stamp} ns came during the run of {run.image_stamp} ns, the same run"
+                " by its track; ignored"
             )
         coherent = coherent_image_from_msgs(image, info)
         run.stream.take_image(coherent)
@@ -270,11 +270,11 @@ class SubApertureNode(CsasNode):
             if run.name == name:
                 return run
         if name in self.over:
-            raise ViewError(f"{what} came after the run of {name} ns was over; it is not used")
+            raise ViewError(f"{what} came after the run of {name} ns was over; ignored")
         if len(self.runs) > _MOST_WAITING:
             raise ViewError(
                 f"{what} begins another run while {_MOST_WAITING} wait for that of {self.runs[0].name} ns;"
-                " it is not used"
+                " ignored"
             )
         run = self.new_run(name)
         self.runs.append(run)
@@ -420,7 +420,7 @@ class SubApertureNode(CsasNode):
         if not (hopeless or through):
             return
         if hopeless and not run.failed:
-            self.reject(f"the run of {run.name} ns is given up: {self.waiting() or 'it has no views'}")
+            self.reject(f"giving up the run of {run.name} ns: {self.waiting() or 'it has no views'}")
         self.over[run.name] = run.image_stamp
         while len(self.over) > 16:
             self.over.pop(next(iter(self.over)))
@@ -485,7 +485,7 @@ class SubApertureNode(CsasNode):
     def send_view(self, stamp: int) -> None:
         """Make and publish the view of a stamp."""
         if self.sub_apertures is None:
-            raise ViewError(f"view {stamp} ns was asked for before there is an image")
+            raise ViewError(f"view {stamp} ns requested before any image")
         view = self.sub_apertures.view_of_aspect(self.aspects[stamp])
         image, info = view_to_msgs(self.messages, view, "sub_aperture", trusted=True)
         self.source.info.publish(info)

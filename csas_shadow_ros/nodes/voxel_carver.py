@@ -248,13 +248,13 @@ class VoxelCarverNode(CsasNode):
         """Say what the run has left."""
         result = self.result
         if result is None:
-            self.get_logger().info("complete: no view came; no object as far as anybody knows")
+            self.get_logger().info("complete: no view came, so no object is known")
             return
         d = result.dimensions
         found = result.verdict if d is None else f"{d.length_m:.3f} x {d.width_m:.3f} x {d.height_m:.3f} m"
         name = "" if result.run_ns is None else f" of run {result.run_ns}"
         self.get_logger().info(
-            f"complete{name}: {result.views_used} views, {found} ({result.quality.verdict}); it is published"
+            f"complete{name}: {result.views_used} views, {found} ({result.quality.verdict}); published"
         )
         slope = result.grid.seabed if result.grid is not None else None
         if slope is not None and slope.believed:

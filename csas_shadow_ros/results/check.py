@@ -140,7 +140,7 @@ def check_results(folder: str | Path) -> ResultsCheck:
     try:
         listed = dict(_sums(_read(base / CHECKSUMS)))
     except (OSError, ValueError) as wrong:
-        error(CHECKSUMS, f"cannot be read: {wrong}; without it nothing tells what the files were")
+        error(CHECKSUMS, f"cannot be read: {wrong}; without it the files cannot be checked")
         return _sorted(check)
     there = dict(_files(base))
     for name, sum_ in listed.items():
@@ -173,7 +173,7 @@ def _sorted(check: ResultsCheck) -> ResultsCheck:
 
 def _read(path: Path) -> str:
     if not stat.S_ISREG(os.lstat(path).st_mode):
-        raise ValueError("it is no plain file")
+        raise ValueError("it is not a plain file")
     if (size := path.stat().st_size) > _MOST_BYTES:
         raise ValueError(f"it has {size} bytes; expected at most {_MOST_BYTES}")
     return path.read_text(encoding="utf-8")

@@ -160,7 +160,7 @@ class ResultsWriter:
                 )
             if is_results_folder(self.folder):
                 return
-        raise ResultsError(f"{self.folder} is there and is no results folder: not replaced")
+        raise ResultsError(f"{self.folder} exists and is not a results folder: not replaced")
 
     def write_source(
         self, image: CoherentImage | None, track: Track | None, reader: BagReader | None = None
@@ -426,6 +426,6 @@ def read_report(folder: str | Path) -> dict[str, Any]:
         If it is none.
     """
     if not is_results_folder(folder):
-        raise ResultsError(f"{folder} is no results folder: it holds no {REPORT} of this package")
+        raise ResultsError(f"{folder} is not a results folder: it holds no {REPORT} of this package")
     report: dict[str, Any] = json.loads((Path(folder) / REPORT).read_text(encoding="utf-8"))
     return report

@@ -145,7 +145,7 @@ def read_truth(bag: str | Path) -> KnownTruth | None:
 def _bounded(path: Path, most: int) -> bytes:
     """Read a file of at most so many bytes; a pipe, which may never end, is no file."""
     if not path.is_file():
-        raise ValueError(f"{path.name} is no plain file")
+        raise ValueError(f"{path.name} is not a plain file")
     if (size := path.stat().st_size) > most:
         raise ValueError(f"{path.name} has {size} bytes; expected at most {most}")
     return path.read_bytes()

@@ -194,7 +194,7 @@ class Desk:
     @staticmethod
     def _apply(document: dict[str, Any], change: Any) -> None:
         if not isinstance(change, dict):
-            raise ParameterError("a change is no object; expected id, kind, base and value")
+            raise ParameterError("a change is not an object; expected id, kind, base and value")
         name, kind, base, value = (change.get(key) for key in ("id", "kind", "base", "value"))
         if not isinstance(name, str) or not _ID.fullmatch(name):
             raise ParameterError(f"id is {str(name)[:40]!r}; expected small letters, digits, - and _")
@@ -213,7 +213,7 @@ class Desk:
                 document["revision"] += 1
             return
         if not isinstance(value, dict):
-            raise ParameterError("value is no object; expected one, or null")
+            raise ParameterError("value is not an object; expected one, or null")
         made = _KINDS[kind](value)
         if there is not None and there["value"] == made:
             return

@@ -162,7 +162,7 @@ class ViewStore:
             "contacts": [],
             "report": None,
             "progress": None,
-            "desk": {"why": "judgements are kept beside a results folder alone", "revision": 0, "items": {}},
+            "desk": {"why": "judgements need a results folder", "revision": 0, "items": {}},
             "meshes": {},
             "other": None,
         }
@@ -320,7 +320,7 @@ class ViewStore:
     def contour(self, stamp_ns: int, name: str = "shadow_mask") -> list[list[float]]:
         """Return the outline of a view's segmented shadow."""
         if kind_of(name) != "mask":
-            raise ViewerError(f"{name[:40]!r} is no set of masks")
+            raise ViewerError(f"{name[:40]!r} is not a set of masks")
         return codes.contour(self.entry(name, stamp_ns).load())
 
     def _cached_bytes(self, key: tuple[str, ...], make: Callable[[], bytes]) -> bytes:

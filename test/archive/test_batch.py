@@ -278,7 +278,7 @@ def test_a_second_batch_of_one_archive_is_refused(failing, tmp_path):
 
 
 def test_a_folder_of_other_things_is_no_archive(failing, tmp_path):
-    with pytest.raises(ArchiveError, match="is no archive; expected a new folder"):
+    with pytest.raises(ArchiveError, match="is not an archive; expected a new folder"):
         run_batch([failing], failing, Threads, OPTIONS)
     assert not (failing / "runs").exists()
 

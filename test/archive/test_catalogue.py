@@ -243,7 +243,7 @@ def test_an_empty_catalogue_can_be_read_and_asked(tmp_path):
     assert table_of(Found(folder).where("length_m > 1").same().rows()) == "nothing found"
     with pytest.raises(ArchiveError, match="holds no catalogue; expected one by batch"):
         Found(tmp_path)
-    with pytest.raises(ArchiveError, match="is no folder; expected an archive"):
+    with pytest.raises(ArchiveError, match="is not a folder; expected an archive"):
         rebuild(tmp_path / "gone")
 
 

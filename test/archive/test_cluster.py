@@ -129,7 +129,7 @@ def test_killed_workers_scheduler_and_batch_of_a_cluster_cost_only_what_was_in_f
     said = first.communicate(timeout=120)[1]
     assert first.returncode == 1
     assert said.splitlines()[-1].startswith("csas-shadow: error: scheduler ")
-    assert "is gone; what is done is kept, the same command goes on" in said
+    assert "is gone; finished bags are kept, the same command resumes" in said
     cluster.end()
     assert before.items() <= done(out).items()
 

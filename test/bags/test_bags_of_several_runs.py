@@ -236,7 +236,7 @@ def test_sectors_outside_the_run_are_passed_over_and_named_once(tmp_path):
     assert len(run.sector_sum().stamps) == 12
     (problem,) = run.problems
     assert "no track covers the stamps of 3 sector messages" in problem.reason
-    assert problem.reason.endswith("they are passed over")
+    assert problem.reason.endswith("they are skipped")
 
 
 def test_a_stamp_that_two_tracks_cover_is_told(tmp_path):

@@ -498,7 +498,7 @@ def test_what_is_no_bag_is_refused_by_name(tmp_path):
     with pytest.raises(BagError, match=r"empty\.mcap is empty \(0 bytes\); expected an MCAP file"):
         read_run(tmp_path / "empty.mcap")
     (tmp_path / "text.mcap").write_text("this is no bag")
-    with pytest.raises(BagError, match=r"text\.mcap is no MCAP file \(starts with b'this is '\)"):
+    with pytest.raises(BagError, match=r"text\.mcap is not an MCAP file \(starts with b'this is '\)"):
         read_run(tmp_path / "text.mcap")
     (tmp_path / "old.db3").write_text("this is no database")
     with pytest.raises(BagError, match=r"cannot read .*old\.db3"):
@@ -535,11 +535,11 @@ def test_a_bag_is_not_replaced_unless_asked_and_nothing_else_ever(tmp_path, imag
         write_run(path, image, track)
     write_run(path, image, track, overwrite=True)
     (path / "notes.txt").write_text("mine")
-    with pytest.raises(BagError, match="is there and is no bag: not replaced"):
+    with pytest.raises(BagError, match="exists and is not a bag: not replaced"):
         write_run(path, image, track, overwrite=True)
     assert (path / "notes.txt").read_text() == "mine"
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(BagError, match="is there and is no bag"):
+    with pytest.raises(BagError, match="exists and is not a bag"):
         write_run(tmp_path / "file", image, track, overwrite=True)
 
 

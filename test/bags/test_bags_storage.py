@@ -335,7 +335,7 @@ def test_a_name_in_metadata_leads_to_no_file_beside_the_bag(tmp_path, name):
 def test_messages_that_metadata_tells_of_and_the_files_lack_are_told(tmp_path):
     path = write(tmp_path / "bag", messages())
     edit(path, message_count=36)
-    assert any("tells of 36 messages; the files hold 12" in line for line in BagReader(path).problems)
+    assert any("lists 36 messages; the files hold 12" in line for line in BagReader(path).problems)
 
 
 @pytest.mark.parametrize("order", ["names without zeros", "every other one", "reversed"])

@@ -598,7 +598,7 @@ def test_a_results_folder_is_replaced_only_when_asked_and_nothing_else_ever_is(t
     (mine / "thesis.txt").write_text("years of work")
     refused = run_quickly(tiny_empty_bag.path, mine, "--overwrite")
     assert refused.code == 1
-    assert "no results folder: not replaced" in refused.err
+    assert "not a results folder: not replaced" in refused.err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine", "r"]
 
 
@@ -608,7 +608,7 @@ def test_a_run_that_breaks_leaves_nothing_behind(tmp_path):
         raise RuntimeError("power cut")
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("")
-    with pytest.raises(ResultsError, match="no results folder"):
+    with pytest.raises(ResultsError, match="not a results folder"):
         ResultsWriter(tmp_path / "file", overwrite=True)
     assert not is_results_folder(tmp_path)
 

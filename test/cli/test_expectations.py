@@ -99,7 +99,7 @@ def test_what_is_not_as_expected_is_named_with_both_values(
         ("length_m: {min: a}", "expected numbers named"),
         ("length_m: {min: 2, max: 1}", "which no value can be"),
         ("length_m: []", "expected a value, a list of them, or bounds"),
-        ("- a", "is no mapping"),
+        ("- a", "is not a mapping"),
         ("a: {", "cannot be read"),
     ],
 )

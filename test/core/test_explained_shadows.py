@@ -179,8 +179,8 @@ def evidence(unexplained=0.0, lit=0.0, n=10):
     ("unexplained", "lit", "quality", "word"),
     [
         (0.03, 0.01, "good", ""),
-        (0.15, 0.0, "limited", "15 % of the shadow is not explained"),
-        (0.45, 0.0, "not trustworthy", "45 % of the shadow is not explained"),
+        (0.15, 0.0, "limited", "15 % of the shadow is unexplained"),
+        (0.45, 0.0, "not trustworthy", "45 % of the shadow is unexplained"),
         (0.0, 0.2, "not trustworthy", "20 % of the shadow that it would cast is lit"),
     ],
 )

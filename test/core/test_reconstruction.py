@@ -155,7 +155,7 @@ def test_a_volume_that_lies_within_the_object_is_told(whole, method, size_m):
     found = carved.result()
     assert found.verdict == "object"
     assert found.quality.verdict == "not trustworthy"
-    assert any("lies inside of the object" in reason for reason in found.quality.reasons)
+    assert any("lies inside the object" in reason for reason in found.quality.reasons)
 
 
 def test_without_a_usable_view_the_answer_is_undecided(whole):

@@ -221,11 +221,11 @@ def test_what_the_results_lack_is_told(changed, tmp_path, capsys):
 def test_slips_are_one_line(results, tmp_path, monkeypatch):
     with pytest.raises(ParameterError, match="format is 'shp'; expected one of: geotiff, geojson"):
         export_result(results, tmp_path / "maps", ["shp"])
-    with pytest.raises(ResultsError, match="is no results folder"):
+    with pytest.raises(ResultsError, match="is not a results folder"):
         export_result(tmp_path, tmp_path / "maps")
     with pytest.raises(MapError, match="exists already"):
         export_result(results, results, ["kml"])
-    with pytest.raises(MapError, match="is no folder of maps: not replaced"):
+    with pytest.raises(MapError, match="is not a folder of maps: not replaced"):
         export_result(results, results, ["kml"], overwrite=True)
     monkeypatch.setitem(sys.modules, "rasterio", None)
     with pytest.raises(MissingExtraError, match=r"needs rasterio.*csas_shadow_ros\[maps\]"):

@@ -90,7 +90,7 @@ def test_an_origin_on_its_topic_is_passed_on_as_a_transform(graph: Graph) -> Non
 def test_a_scene_cannot_be_its_own_parent(graph: Graph) -> None:
     node = VoxelCarverNode(context=graph.context, overrides={"parent_frame": "csas_scene"})
     assert not node.start()
-    assert "parent_frame is 'csas_scene'; expected a frame that is not the scene's" in node.error
+    assert "parent_frame is 'csas_scene'; expected a frame other than the scene's" in node.error
     node.destroy_node()
 
 

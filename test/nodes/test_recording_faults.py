@@ -152,7 +152,7 @@ def test_a_sink_that_cannot_work_is_waited_for_a_while_and_the_others_go_on() ->
         look()
     assert flow.finished
     told = [text for _, text in flow.notes if "bag_recorder" in text]
-    assert told[0].startswith("bag_recorder cannot take likelihood: the disk is full; it is waited for, 60 s")
+    assert told[0].startswith("bag_recorder cannot take likelihood: the disk is full; waiting for it, 60 s")
     assert told[1:] == ["bag_recorder did not come back in 60 s; going on"]
     say("bag_recorder")
     flow.look()

@@ -45,22 +45,22 @@ def driver(graph: Graph) -> Iterator[Node]:
             "track",
             ODOMETRY,
             qos.LATCHED,
-            "/csas/track: /csas/driver publishes nav_msgs/msg/Odometry, which is not taken; expected"
+            "/csas/track: /csas/driver publishes nav_msgs/msg/Odometry; expected"
             " nav_msgs/msg/Path",
         ),
         (
             "sector/image",
             IMAGE,
             SENSOR,
-            "/csas/sector/image: /csas/driver publishes sensor_msgs/msg/Image best effort, which is not"
-            " taken; expected it reliable",
+            "/csas/sector/image: /csas/driver publishes sensor_msgs/msg/Image best effort;"
+            " expected reliable",
         ),
         (
             "progress",
             "diagnostic_msgs/msg/DiagnosticArray",
             qos.VIEWS,
-            "/csas/progress: /csas/driver publishes diagnostic_msgs/msg/DiagnosticArray volatile, which is"
-            " not taken; expected it transient local",
+            "/csas/progress: /csas/driver publishes diagnostic_msgs/msg/DiagnosticArray volatile;"
+            " expected transient local",
         ),
     ],
     ids=["another type", "best effort", "volatile"],

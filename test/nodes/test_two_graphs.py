@@ -44,7 +44,7 @@ def test_the_same_draw_of_random_numbers_leaves_each_a_domain_of_its_own() -> No
         taken.append(DomainReservation())
     try:
         assert len({one.domain_id for one in taken}) == 4
-        with pytest.raises(ReplayError, match=f"ROS domain {taken[0].domain_id} is taken by another replay"):
+        with pytest.raises(ReplayError, match=f"ROS domain {taken[0].domain_id} is held by another replay"):
             DomainReservation(taken[0].domain_id)
     finally:
         for one in taken:
@@ -114,7 +114,7 @@ def test_a_replay_of_a_bag_of_two_runs_plays_the_one_whose_namespace_it_is_told(
 
 
 def test_two_replays_into_one_domain_are_one_too_many(domain: int, run_bag: Path) -> None:
-    with pytest.raises(ReplayError, match=f"ROS domain {domain} is taken by another replay on this machine"):
+    with pytest.raises(ReplayError, match=f"ROS domain {domain} is held by another replay on this machine"):
         replay(run_bag, parameters=PARAMETERS, domain_id=domain, progress=False)
 
 

@@ -367,7 +367,7 @@ SPOILT = [
     (lambda f: (f / "report.json").write_text("[" * 100_000), "error: report.json: cannot be read"),
     (lambda f: (f / "report.json").unlink(), "error: report.json: is missing"),
     (of_another_version, "its format is 'csas_shadow_ros results 9'; expected 'csas_shadow_ros results 1'"),
-    (lambda f: (f / CHECKSUMS).unlink(), "without it nothing tells what the files were"),
+    (lambda f: (f / CHECKSUMS).unlink(), "without it the files cannot be checked"),
     (lambda f: (f / CHECKSUMS).write_text("0" * 64 + "  ../../etc/passwd\n"), "line 1 is "),
     (lambda f: (f / CHECKSUMS).write_bytes(b"\xff" * 99), "SHA256SUMS: cannot be read"),
     (pipe_for_grid, "error: grid.npz: is a pipe or a device; expected a plain file"),

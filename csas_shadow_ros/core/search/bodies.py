@@ -100,7 +100,7 @@ _SHADOW_POWER = 0.4
 #: Why a body that is consistent only with the other sign is none, and no evidence for that sign either.
 HOLLOW = (
     "its shadow falls towards the sonar: a hollow in the seabed, or a bright body and the wrong"
-    " spectrum_sign; a body without bright seabed before it was needed to tell"
+    " spectrum_sign; only a body without bright seabed before it would decide"
 )
 
 
@@ -434,7 +434,7 @@ class _Judged:
                 LeftOut(
                     (x, y),
                     f"dark by {thrown.contrast_db:.0f} dB, but throws its shadow {thrown.length_m:.2f} m far:"
-                    f" sediment, or too low to tell; a shadow of {_THROWN_CELLS * cell:.2f} m was needed",
+                    f" sediment, or too low to tell; expected a shadow of {_THROWN_CELLS * cell:.2f} m",
                     strong=True,
                 )
             )
@@ -449,7 +449,7 @@ class _Judged:
                 LeftOut(
                     (x, y),
                     f"dark by {thrown.contrast_db:.0f} dB, but {100 * thrown.power:.0f} % lit where its"
-                    f" shadow must fall: sediment, or a body; at most {100 * _CAST:.0f} % was needed",
+                    f" shadow must fall: sediment, or a body; expected at most {100 * _CAST:.0f} %",
                     strong=True,
                 )
             )

@@ -253,7 +253,7 @@ def scene_of(first: HasBand) -> GroundGrid:
     across, down = width * high / math.pi, height * high / math.pi
     if not (across * down <= MAX_SCENE_PIXELS and max(across, down) < 1 << 16):
         raise GeometryError(
-            f"it covers {width:.4g} by {height:.4g} m, whose image at this band would have {across:.3g} by"
+            f"it covers {width:.4g} by {height:.4g} m: at this band the image would have {across:.3g} by"
             f" {down:.3g} pixels; expected at most {MAX_SCENE_PIXELS:.3g} in all"
         )
     least = math.ceil(width * high / math.pi)

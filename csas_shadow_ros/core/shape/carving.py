@@ -425,7 +425,7 @@ class Carver:
         if view.info.stamp_ns in self.stamps:
             return False
         if len(self.stamps) >= np.iinfo(np.uint16).max:
-            raise ViewError(f"the grid holds {len(self.stamps)} views; expected no more than that")
+            raise ViewError(f"the grid holds {len(self.stamps)} views; expected no more")
         self._check(view)
         top = self.volume.z_m[-1]
         if top >= view.info.camera.sonar_m[2]:

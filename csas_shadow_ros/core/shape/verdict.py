@@ -57,7 +57,7 @@ def judge(result: Result) -> None:
     if result.mesh is not None and result.grid is not None:
         sides = cut_sides(result.grid)
         if len(sides) == _ALL_SIDES:
-            reasons.append("the carved volume lies inside of the object: it ends at no side of it")
+            reasons.append("the carved volume lies inside the object, which reaches past all its sides")
         else:
             reasons += [f"the carved volume cuts the object at its {side}" for side in sides]
         worst = 2 if sides else worst
@@ -124,7 +124,7 @@ def _pieces(result: Result) -> list[str]:
     if not result.final:
         return []
     return [
-        f"object {number} has no intervals: it is a piece of what was carved together, its sizes are rough"
+        f"object {number} has no intervals and rough sizes: it is a piece of a body carved as one"
         for number, one in enumerate(result.further, start=2)
         if not one.dimensions.intervals
     ]
@@ -186,7 +186,7 @@ def _fit_of(result: Result, reasons: list[str]) -> int:
         _mean([getattr(one, name) for one in result.evidence.values()]) for name in ("unexplained", "lit")
     )
     for share, some, most, text in (
-        (unexplained, _UNEXPLAINED, _MOST_UNEXPLAINED, "of the shadow is not explained by what was found"),
+        (unexplained, _UNEXPLAINED, _MOST_UNEXPLAINED, "of the shadow is unexplained"),
         (lit, _LIT, _MOST_LIT, "of the shadow that it would cast is lit in the views"),
     ):
         if share > some:

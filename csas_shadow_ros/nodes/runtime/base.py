@@ -320,9 +320,9 @@ class CsasNode(LifecycleNode):
         if who and not self.rival:
             domain = self.context.get_domain_id()
             self.rival = f"{who} is at work in {self.get_namespace()}, ROS domain {domain}"
-            self.get_logger().error(f"{self.rival}: nothing is taken or sent until it has ended")
+            self.get_logger().error(f"{self.rival}: receiving and sending nothing until it ends")
         elif not who and self.rival:
-            self.get_logger().warning(f"{self.rival.partition(' is at work')[0]} has gone: going on")
+            self.get_logger().warning(f"{self.rival.partition(' is at work')[0]} has gone: resuming")
             self.rival = ""
             if not self.keeps_its_state():
                 self._begin_anew()
@@ -351,9 +351,9 @@ class CsasNode(LifecycleNode):
         """Say, at once and in every heartbeat, that the node can take nothing, or again can (empty)."""
         before, self.unable = self.unable, why
         if why and not before:
-            self.get_logger().error(f"{why}: nothing is taken")
+            self.get_logger().error(f"{why}: receiving nothing")
         elif before and not why:
-            self.get_logger().warning("goes on")
+            self.get_logger().warning("resuming")
         if bool(why) != bool(before):
             self.tell_now()
 
@@ -701,7 +701,7 @@ class Unlatched:
             for p in lossy:
                 who = f"{p.node_namespace.rstrip('/')}/{p.node_name}"
                 self._node.get_logger().warning(
-                    f"{name}: {who} publishes best effort: what is lost on the way is not sent again"
+                    f"{name}: {who} publishes best effort: lost messages are not resent"
                 )
 
 
@@ -766,16 +766,16 @@ class Strangers:
         who = f"{topic}: {publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
         expected = _type_name(subscriptions[0].msg_type)
         if publisher.topic_type != expected:
-            return f"{who} publishes {publisher.topic_type}, which is not taken; expected {expected}"
+            return f"{who} publishes {publisher.topic_type}; expected {expected}"
         offered = publisher.qos_profile
         checks = [qos_check_compatible(offered, one.qos_profile) for one in subscriptions]
         if any(level != QoSCompatibility.ERROR for level, _ in checks):
             return ""
         if offered.reliability == ReliabilityPolicy.BEST_EFFORT:
-            return f"{who} publishes {expected} best effort, which is not taken; expected it reliable"
+            return f"{who} publishes {expected} best effort; expected reliable"
         if offered.durability == DurabilityPolicy.VOLATILE:
-            return f"{who} publishes {expected} volatile, which is not taken; expected it transient local"
-        return f"{who} publishes {expected} with a QoS that is not taken: {checks[0][1].rstrip('; ')}"
+            return f"{who} publishes {expected} volatile; expected transient local"
+        return f"{who} publishes {expected} with an incompatible QoS: {checks[0][1].rstrip('; ')}"
 
 
 def _brief(topics: Iterable[str]) -> str:
@@ -872,7 +872,7 @@ class Inlet:
         elif time.monotonic() - since_s <= patience_s:
             self.held.append((since_s, image, info))
         else:
-            self.refuse(stamp, info, f"{self.stream} stamped {stamp} ns: {reason}; it is not used")
+            self.refuse(stamp, info, f"{self.stream} stamped {stamp} ns: {reason}; ignored")
 
     def _work_on(self, image: Any, info: Any) -> None:
         stamp = stamp_to_ns(image.header.stamp)
@@ -1203,7 +1203,7 @@ class TargetInlet:
             if not decision.same_target(self.decision):
                 self._node.reject(
                     f"target stamped {stamp} ns lies elsewhere than that of {self._node.target_stamp} ns, and"
-                    " nothing says that another run has begun: the first one is kept"
+                    " no message begins another run: keeping the first"
                 )
             return
         if self.known:
@@ -1218,7 +1218,7 @@ class TargetInlet:
 
     def missing(self) -> str:
         """Say why there is nothing to go by yet; empty once it is known."""
-        return "" if self.known else "no target position: nothing came on topic target, and none is given"
+        return "" if self.known else "no target position: none received on topic target, none given"
 
     def hold(self, _: int) -> tuple[str, float]:
         """Let views wait until the target is known."""

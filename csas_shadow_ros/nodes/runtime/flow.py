@@ -220,7 +220,7 @@ class Flow:
         """Wait, for a while, for a sink that was counted on and says that it cannot work."""
         if why and not peer.unable and peer.role == "sink" and peer.alive:
             self._gone[peer.node, peer.stream] = self.clock()
-            wait = f"it is waited for, {self.sink_wait_s:g} s at most"
+            wait = f"waiting for it, {self.sink_wait_s:g} s at most"
             self.notes.append(("warn", f"{peer.node} cannot take {peer.stream}: {why}; {wait}"))
         peer.unable = why
 
@@ -378,7 +378,7 @@ class Flow:
         if new and self._all_there():
             new = now - self._arrived_s < _LAST_WORD_S
         if new or now - self._back_s < min(_CATCH_UP_S, self.settle_s):
-            return "whoever else is there to be heard"
+            return "other nodes to appear"
         if others := sorted({p.node for p in self.live() if not self._counts(p)}):
             return f"{', '.join(others)} to take the target"
         if self._gone and not self.sinks():
@@ -387,7 +387,7 @@ class Flow:
         # who vanishes is in `_gone`.
         begun = self._serial > 0
         if not begun and now - self._born_s < self.sink_wait_s and len(self.sinks()) < self.min_sinks:
-            return f"{self.min_sinks} sinks ({len(self.sinks())} are there)"
+            return f"{self.min_sinks} sinks ({len(self.sinks())} present)"
         if not self._leaves and not self._subscribers and now - self._served_s < self.sink_wait_s:
             return "a consumer"
         return ""

@@ -119,7 +119,7 @@ def make_hearing(make: Callable[[], Made], take_back: Callable[[Made], None]) ->
         gc.collect()  # nodes hold their participant until they are collected
         if time.monotonic() > end:
             raise RuntimeError(
-                f"another process holds a port of this one in shared memory since {_PATIENCE_S:g} s;"
-                " expected a ROS domain whose ports are free"
+                f"another process has held a shared-memory port of this one for {_PATIENCE_S:g} s;"
+                " expected a ROS domain with free ports"
             )
         time.sleep(_AGAIN_S)

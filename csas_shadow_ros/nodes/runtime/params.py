@@ -163,7 +163,7 @@ class VoxelCarverNodeParameters(
         """Refuse half a place."""
         super().check()
         if math.isnan(self.parent_lat_deg) != math.isnan(self.parent_lon_deg):
-            raise ParameterError("of parent_lat_deg and parent_lon_deg one is given; expected both or none")
+            raise ParameterError("only one of parent_lat_deg, parent_lon_deg is given; expected both or none")
 
 
 @dataclass(frozen=True)

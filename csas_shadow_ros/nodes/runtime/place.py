@@ -47,7 +47,7 @@ class PlaceOnEarth:
         self._parent = p.parent_frame
         if self._parent == (p.scene_frame or SCENE_FRAME) or not self._parent:
             raise ParameterError(
-                f"parent_frame is {self._parent!r}; expected a frame that is not the scene's"
+                f"parent_frame is {self._parent!r}; expected a frame other than the scene's"
             )
         self._parent_deg = None if math.isnan(p.parent_lat_deg) else (p.parent_lat_deg, p.parent_lon_deg)
         self._origins: deque[Origin] = deque(maxlen=_MOST)
