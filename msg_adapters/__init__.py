@@ -1,4 +1,4 @@
-"""ROS messages to and from the core's types: a pair of functions a message, and no computing.
+"""ROS messages to and from the core's types: a pair of functions per message, and no computing.
 
 Readers (`x_from_msg`) are duck-typed: they take an rclpy message and a rosbags one alike. Writers
 (`x_to_msg`) take a `MessageFactory`: `RclpyMessages()` or `RosbagsMessages()`. Nothing here imports

@@ -1,4 +1,4 @@
-"""diagnostic_msgs/DiagnosticArray to and from what each view contributed."""
+"""diagnostic_msgs/DiagnosticArray to and from the contribution of each view."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _WHERE = "evidence"
 
 
 def evidence_to_msg(factory: MessageFactory, evidence: Mapping[int, ViewEvidence], stamp_ns: int) -> Any:
-    """Make the DiagnosticArray of what each view contributed: a status a view, named by its stamp (ns).
+    """Make the DiagnosticArray of each view's contribution: one status per view, named by its stamp (ns).
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def _status(one: ViewEvidence) -> Status:
 
 
 def evidence_from_msg(msg: Any) -> dict[int, ViewEvidence]:
-    """Read what each view contributed, by stamp, to the last digit.
+    """Read each view's contribution, by stamp, to the last digit.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""diagnostic_msgs/DiagnosticArray to and from what a run says of its objects, and how sure it is."""
+"""diagnostic_msgs/DiagnosticArray to and from a run's objects with their uncertainty."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ _KEYS = {
 
 @dataclass(frozen=True)
 class GridFacts:
-    """What the images of a grid do not hold, or not to the last digit.
+    """Facts of a grid that its images lack, or hold only rounded.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ class MeasuredObject:
 
 @dataclass(frozen=True)
 class Measurements:
-    """What a run says of its objects, and how far that can be trusted.
+    """A run's objects, verdict and quality.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def numbered_objects(result: Result) -> dict[int, ObjectResult]:
 
 
 def half_width(dimensions: Dimensions, name: str, scale: float = 1.0, digits: int = 3) -> str:
-    """Return half of a measure's 95 % interval as `` ± 0.012``; nothing where there is no interval."""
+    """Return half of a measure's 95 % interval as `` ± 0.012``; empty without an interval."""
     if name not in dimensions.intervals:
         return ""
     low, high = dimensions.intervals[name]
@@ -184,7 +184,7 @@ def half_width(dimensions: Dimensions, name: str, scale: float = 1.0, digits: in
 
 
 def measurements_to_msg(factory: MessageFactory, result: Result, stamp_ns: int | None = None) -> Any:
-    """Make the DiagnosticArray of a result: a status of the run, one an object, and one a body left out.
+    """Make the DiagnosticArray of a result: one status for the run, each object and each body left out.
 
     Parameters
     ----------
@@ -330,7 +330,7 @@ def _object_values(one: ObjectResult) -> dict[str, Value]:
 
 
 def measurements_from_msg(msg: Any) -> Measurements:
-    """Read what a run says of its objects, to the last digit; values that it does not know are passed over.
+    """Read a run's objects, to the last digit; ignore unknown values.
 
     Parameters
     ----------

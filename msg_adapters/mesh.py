@@ -52,7 +52,7 @@ def colour(factory: MessageFactory, rgba: tuple[float, float, float, float]) -> 
 
 
 def check_marker(msg: Any, kind: int, name: str, where: str) -> bool:
-    """Check a marker's type, frame and pose; return False if it says that there is no object.
+    """Check a marker's type, frame and pose; return False if it means no object.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def check_marker(msg: Any, kind: int, name: str, where: str) -> bool:
 
 
 def mesh_to_msg(factory: MessageFactory, mesh: trimesh.Trimesh | None, stamp_ns: int) -> Any:
-    """Make the Marker of a mesh in metres, scene frame; no mesh (or an empty one) takes it away.
+    """Make the Marker of a mesh in metres, scene frame; no mesh (or an empty one) deletes it.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def mesh_to_msg(factory: MessageFactory, mesh: trimesh.Trimesh | None, stamp_ns:
 
 
 def mesh_from_msg(msg: Any, where: str = "mesh") -> trimesh.Trimesh | None:
-    """Read a mesh (equal corners merged to one vertex); None if the marker takes it away.
+    """Read a mesh (equal corners merged to one vertex); None if the marker deletes it.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ MAX_QUOTED = 40
 
 
 def quoted(value: Any) -> str:
-    """Return a value as an error quotes it: a text in quotation marks, cut to about 40 characters.
+    """Quote a value for an error: a text in quotation marks, cut to about 40 characters.
 
     Examples
     --------
@@ -55,7 +55,7 @@ def quoted(value: Any) -> str:
 
 
 class MessageFactory(Protocol):
-    """What a writer needs to know of a message world."""
+    """What a writer needs from a message library."""
 
     #: Frame of the headers that are made with it.
     frame_id: str
@@ -67,7 +67,7 @@ class MessageFactory(Protocol):
         """Return the message class of a type such as ``sensor_msgs/msg/Image``."""
 
     def make(self, type_name: str, **fields: Any) -> Any:
-        """Make a message; fields that are not given have their default value."""
+        """Make a message; omitted fields keep their defaults."""
 
     def octets(self, data: NDArray[Any]) -> Any:
         """Return a C-contiguous array's memory as the value of a ``uint8[]`` field."""
@@ -122,7 +122,7 @@ class RclpyMessages:
         return found
 
     def make(self, type_name: str, **fields: Any) -> Any:
-        """Make a message; fields that are not given have their default value."""
+        """Make a message; omitted fields keep their defaults."""
         large = fields.pop("data") if isinstance(fields.get("data"), array.array) else None
         message = self.cls(type_name)(**fields)
         if large is not None:
@@ -192,7 +192,7 @@ class RosbagsMessages:
             raise AdapterError(f"message type {type_name} is unknown to rosbags' Jazzy definitions") from None
 
     def make(self, type_name: str, **fields: Any) -> Any:
-        """Make a message; fields that are not given have their default value."""
+        """Make a message; omitted fields keep their defaults."""
         cls = self.cls(type_name)
         names = self._store().fielddefs[type_name][1]
         known = {name for name, _ in names}
@@ -434,7 +434,7 @@ def data_stamp_to_ns(stamp: Any, where: str) -> int:
 
 
 def check_data_stamp(stamp_ns: int, where: str) -> None:
-    """Refuse to write an image or a sector that no reader takes: one whose stamp is 0.
+    """Refuse to write an image or a sector with stamp 0, which no reader accepts.
 
     Raises
     ------
@@ -470,7 +470,7 @@ _MAX_FRAME = 100
 
 
 def frame_of(msg: Any, where: str, expected: str = "") -> str:
-    """Return the frame that a message is in.
+    """Return the frame of a message.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""visualization_msgs/MarkerArray to and from the objects of a run, as any viewer shows them."""
+"""visualization_msgs/MarkerArray to and from the objects of a run, for any viewer."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class ObjectBox:
 def objects_to_msg(
     factory: MessageFactory, result: Result, before: int = 0, stamp_ns: int | None = None
 ) -> Any:
-    """Make the MarkerArray of a result's objects: a CUBE and a label each, DELETE for those that are gone.
+    """Make the MarkerArray of a result's objects: a CUBE and a label each, DELETE for removed ones.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def _markers(factory: MessageFactory, stamp_ns: int, number: int, d: Dimensions)
 
 
 def label_text(number: int, d: Dimensions) -> str:
-    """Write an object's figures, each with half of its 95 % interval where it has one."""
+    """Write an object's figures, each with half of its 95 % interval, if any."""
 
     def metres(name: str) -> str:
         return f"{getattr(d, name):.3f}{half_width(d, name)}"
@@ -139,7 +139,7 @@ def label_text(number: int, d: Dimensions) -> str:
 
 
 def objects_from_msg(msg: Any) -> list[tuple[int, ObjectBox]]:
-    """Read the objects as boxes, by rising number; labels and what is gone are passed over.
+    """Read the objects as boxes, by rising number; skip labels and removed objects.
 
     Measures and their intervals stand in `measurements`, to the last digit; a heading is here to rounding.
 

@@ -1,4 +1,4 @@
-"""sensor_msgs/NavSatFix and geometry_msgs/TransformStamped: where on earth a scene is."""
+"""sensor_msgs/NavSatFix and geometry_msgs/TransformStamped to and from a scene's place on earth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Image and CameraInfo together, to and from the core's types; and finding the two of a stamp."""
+"""Image and CameraInfo pairs to and from the core's types, and pairing by stamp."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ def voxel_grid_to_msgs(
 def voxel_grid_from_msgs(
     image: Any, info: Any, stream_name: str = "voxel_grid"
 ) -> tuple[int, Volume, NDArray[Any]]:
-    """Read a dense grid: likelihoods, counts of views (`voxel_views`), or what is matter (`matter`).
+    """Read a dense grid: likelihoods, counts of views (`voxel_views`), or matter (`matter`).
 
     Returns
     -------
@@ -244,7 +244,7 @@ class Pairer:
         self.orphans: list[str] = []
 
     def add(self, msg: Any, *, is_info: bool) -> tuple[Any, Any] | None:
-        """Take a message; return (image, camera_info) once both of its stamp are there.
+        """Add a message; return (image, camera_info) once both of its stamp have arrived.
 
         Raises
         ------
@@ -270,7 +270,7 @@ class Pairer:
         )
 
     def flush(self) -> list[str]:
-        """Give up on everything that still waits; return all orphans."""
+        """Drop everything that still waits; return all orphans."""
         while self._waiting:
             self._give_up(*self._waiting.popitem(last=False))
         return self.orphans

@@ -1,4 +1,4 @@
-"""diagnostic_msgs/DiagnosticArray to and from what became of a view, and heartbeats."""
+"""diagnostic_msgs/DiagnosticArray to and from the fate of a view, and heartbeats."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class ViewProgress:
     def rejected(
         cls, stamp_ns: int, node: str, instance: str, reason: str, level: Level = Level.WARN
     ) -> ViewProgress:
-        """Say that a view was refused, and why."""
+        """State that a view was refused, and why."""
         return cls(stamp_ns, node, instance, REJECTED, reason, level)
 
 
@@ -112,7 +112,7 @@ class Heartbeat:
 
 
 def instance_of(graph_id: str, process: str) -> str:
-    """Return the identity (``hardware_id``) of a process of a graph; without a graph it is the process' own.
+    """Return the identity (``hardware_id``) of a process; without a graph it is the process' own.
 
     Examples
     --------
@@ -123,7 +123,7 @@ def instance_of(graph_id: str, process: str) -> str:
 
 
 def graph_of(instance: str) -> str:
-    """Return the graph that a process' identity names; empty if none, as of an outside node's.
+    """Return the graph in a process' identity; empty if none, as for an outside node.
 
     Examples
     --------
@@ -155,7 +155,7 @@ def diagnostics_to_msg(
     message: str,
     values: Mapping[str, str],
 ) -> Any:
-    """Make a DiagnosticArray with one status, as `/diagnostics` wants it too."""
+    """Make a DiagnosticArray with one status, also for `/diagnostics`."""
     pairs = [factory.make("diagnostic_msgs/msg/KeyValue", key=k, value=str(v)) for k, v in values.items()]
     status = factory.make(
         "diagnostic_msgs/msg/DiagnosticStatus",
@@ -169,7 +169,7 @@ def diagnostics_to_msg(
 
 
 def is_routine_report(cdr: bytes) -> bool:
-    """Say whether a serialised message of topic `progress` can only tell that a view went well.
+    """Say whether a serialised message of topic `progress` can only report success.
 
     Whoever follows heartbeats and refusals alone need not read it; a False says nothing.
     """

@@ -1,4 +1,4 @@
-"""A run's result to and from messages: all that it holds, to the last digit; nothing is computed again.
+"""A run's result to and from messages: complete, to the last digit, without computing again.
 
 `measurements` says what there is, so that a message that is left of an earlier result is not taken for one of
 this one; all messages of a result carry one stamp.
@@ -51,7 +51,7 @@ def result_to_msgs(
     before: int = 0,
     wanted: Callable[[str], bool] = _all,
 ) -> Iterator[tuple[str, Any]]:
-    """Make the messages of a result, each when it is asked for.
+    """Make the messages of a result, each on demand.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def _voxel_stream(
 
 
 def topics_of_result(measurements: Any) -> list[str]:
-    """Return the topics of the result that a message of `measurements` speaks of: what it is rebuilt from.
+    """Return the topics needed to rebuild the result of a `measurements` message.
 
     Raises
     ------

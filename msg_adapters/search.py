@@ -1,4 +1,4 @@
-"""diagnostic_msgs/DiagnosticArray to and from what is to be carved."""
+"""diagnostic_msgs/DiagnosticArray to and from the decision what to carve."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _BODY = "body"
 
 @dataclass(frozen=True)
 class SearchNews:
-    """A decision, and what it is about.
+    """A decision, and its run and target.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def decision_to_msg(
     target_stamp_ns: int,
     may_move: bool = False,
 ) -> Any:
-    """Make the DiagnosticArray of a decision: a status of the run, one a body, one a body left out.
+    """Make the DiagnosticArray of a decision: one status for the run, each body and each one left out.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""diagnostic_msgs/DiagnosticArray as a list of named statuses, whose values are numbers to the last digit.
+"""diagnostic_msgs/DiagnosticArray as a list of named statuses, with numbers to the last digit.
 
 A number travels as its shortest text that reads back as the same float (`repr`), ``nan`` included. Readers
 pass over values and statuses that they do not know.
@@ -68,7 +68,7 @@ class Status:
         return cls(name, {key: text_of(value) for key, value in values.items()}, message, level)
 
     def refuse(self, key: str, expected: str) -> AdapterError:
-        """Return the error that a value is not what it must be."""
+        """Return the error for an invalid value."""
         return AdapterError(f"{self._at(key)} is {quoted(self.values[key])}; expected {expected}")
 
     def _at(self, key: str) -> str:
@@ -78,7 +78,7 @@ class Status:
         return key in self.values
 
     def text(self, key: str, allowed: tuple[str, ...] = ()) -> str:
-        """Read a text, one of those allowed if there are any.
+        """Read a text, optionally one of an allowed set.
 
         Raises
         ------
@@ -92,7 +92,7 @@ class Status:
         return self.values[key]
 
     def real(self, key: str, *, finite: bool = False) -> float:
-        """Read a number; NaN says that it is not known.
+        """Read a number; NaN means unknown.
 
         Raises
         ------
@@ -219,7 +219,7 @@ def numbered(statuses: Mapping[str, Status], word: str) -> dict[int, Status]:
 
 
 def target_values(target: Target, prefix: str = "") -> dict[str, Value]:
-    """Return the values that hold a body of the search."""
+    """Return the values of a body of the search."""
     (x, y), (dx, dy, dz) = target.position_m, target.size_m
     values: dict[str, Value] = {"x_m": x, "y_m": y, "size_x_m": dx, "size_y_m": dy, "size_z_m": dz}
     values |= {"evidence": target.evidence, "stands": bool(target.stands)}
@@ -244,7 +244,7 @@ def target_of(status: Status, prefix: str = "") -> Target:
 
 
 def sign_values(sign: SignEvidence | None) -> dict[str, Value]:
-    """Return the values that hold the evidence for the spectrum sign; none where it was not checked."""
+    """Return the values of the evidence for the spectrum sign; empty if it was not checked."""
     if sign is None:
         return {}
     return {
@@ -256,7 +256,7 @@ def sign_values(sign: SignEvidence | None) -> dict[str, Value]:
 
 
 def sign_of(status: Status) -> SignEvidence | None:
-    """Read the evidence for the spectrum sign; None where it was not checked.
+    """Read the evidence for the spectrum sign; None if it was not checked.
 
     Raises
     ------
@@ -274,7 +274,7 @@ def sign_of(status: Status) -> SignEvidence | None:
 
 
 def left_out_statuses(left_out: Iterable[LeftOut]) -> list[Status]:
-    """Return a status for each body that is left out: where it is, and why as its message."""
+    """Return a status for each body left out: its place, with the reason as message."""
     found = []
     for number, one in enumerate(left_out, start=1):
         values: dict[str, Value] = {"x_m": one.position_m[0], "y_m": one.position_m[1]}
@@ -285,7 +285,7 @@ def left_out_statuses(left_out: Iterable[LeftOut]) -> list[Status]:
 
 
 def left_out_of(statuses: Mapping[str, Status]) -> tuple[LeftOut, ...]:
-    """Read the bodies that are left out, in their order.
+    """Read the bodies left out, in their order.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""visualization_msgs/Marker CUBE to and from the box that is carved."""
+"""visualization_msgs/Marker CUBE to and from the carved box."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAY_MOVE = "may move"
 
 @dataclass(frozen=True)
 class TargetBox:
-    """The volume that is carved.
+    """The carved volume.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class TargetBox:
 def target_to_msg(
     factory: MessageFactory, box: TargetBox | None, stamp_ns: int, *, may_move: bool = False
 ) -> Any:
-    """Make the Marker of the carved box; None says that there is no object.
+    """Make the Marker of the carved box; None means no object.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def target_to_msg(
 
 
 def target_may_move(msg: Any) -> bool:
-    """Say whether a target's marker is of a run that is still going on."""
+    """Say whether a target's marker belongs to a run that is still going on."""
     return str(getattr(msg, "text", "")) == MAY_MOVE
 
 

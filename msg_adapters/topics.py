@@ -300,7 +300,7 @@ RESULT_TOPICS += ("objects", "evidence", "measurements")
 
 
 def prefixed(prefix: str, name: str) -> str:
-    """Put a prefix before a topic's or a stream's name; '' leaves it as it is.
+    """Put a prefix before a topic's or a stream's name; '' leaves it unchanged.
 
     Raises
     ------
@@ -349,7 +349,7 @@ def is_topic(name: str) -> bool:
 
 
 def is_latched(name: str) -> bool:
-    """Say whether a topic's last message stays for whoever comes late (a relative name)."""
+    """Say whether a topic (relative name) keeps its last message for late subscribers."""
     prefix, rest = split_prefix(name)
     return rest in LATCHED and (not prefix or rest in PREFIXED_TOPICS)
 
@@ -372,7 +372,7 @@ def stream(name: str) -> ImageStream:
 
 
 def absolute_name(name: str, namespace: str = NAMESPACE) -> str:
-    """Join a namespace and a relative topic name; an absolute name is returned as it is."""
+    """Join a namespace and a relative topic name; return an absolute name unchanged."""
     return name if name.startswith("/") else f"{clean_namespace(namespace)}/{name}"
 
 

@@ -38,7 +38,7 @@ MAX_PAUSE_NS = 86_400 * NANOSECONDS
 
 
 def track_to_msg(factory: MessageFactory, track: Track) -> Any:
-    """Make the Path of a track: one stamped pose a position, orientation identity.
+    """Make the Path of a track: one stamped pose per position, orientation identity.
 
     Raises
     ------

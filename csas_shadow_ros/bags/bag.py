@@ -83,7 +83,7 @@ class BagMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """What a bag says of a topic: its type, and how many messages it holds."""
+    """A topic of a bag: its type and number of messages."""
 
     name: str
     type_name: str
@@ -164,7 +164,7 @@ class BagReader:
 
     @property
     def has_checksums(self) -> bool:
-        """Whether changed bits would have been noticed in what was read so far."""
+        """Whether checksums cover everything read so far."""
         return all(f.has_checksums for f in self._files)
 
     @property
@@ -584,7 +584,7 @@ class BagWriter:
         self._last = max(self._last, log_time_ns)
 
     def flush(self) -> None:
-        """Bring what was written so far to the disk: a crash then costs nothing of it.
+        """Flush the written messages to the disk, safe from a crash.
 
         Raises
         ------
@@ -681,7 +681,7 @@ def _serialise(message: Any, type_name: str) -> Any:
 
 
 def copy(reader: BagReader, writer: BagWriter, keep: Callable[[BagMessage], bool] | None = None) -> int:
-    """Copy messages from bag to bag as they are; return how many."""
+    """Copy messages unchanged from bag to bag; return how many."""
     n = 0
     for message in reader.messages():
         if keep is None or keep(message):

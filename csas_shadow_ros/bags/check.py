@@ -1,4 +1,4 @@
-"""Say whether a bag can be processed; and if not, what is wrong with it and what to do about it."""
+"""Check whether a bag can be processed; list its faults and remedies."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Finding:
 
 @dataclass
 class CheckReport:
-    """What `check_bag` found.
+    """The findings of `check_bag`.
 
     Parameters
     ----------
@@ -467,7 +467,7 @@ def _not_round(track: Track) -> str:
 
 
 def judge_image(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, str]]:
-    """Yield (level, problem, remedy) for whatever image, camera_info and track contradict each other in."""
+    """Yield (level, problem, remedy) for contradictions between image, camera_info and track."""
     if track.frame != image.frame:
         yield (
             ERROR,
@@ -482,7 +482,7 @@ def judge_image(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, 
 
 
 def judge_sectors(run: Run, track: Track) -> Iterator[tuple[str, str, str]]:
-    """Yield (level, problem, remedy) for arcs that no sector covers, or that two say they are."""
+    """Yield (level, problem, remedy) for arcs that no sector, or more than one, covers."""
     # Late: it needs the FFT and the compiler.
     from csas_shadow_ros.core.sectors.streaming import uncovered
 

@@ -1,4 +1,4 @@
-"""Random access to the views of a bag: one is read without the others."""
+"""Random access to single views of a bag."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class BagIndex:
         self.files = files
 
     def places(self, stream_name: str, stamps: set[int]) -> dict[int, Callable[[], Any]]:
-        """Return a function for each stamp that reads its image message.
+        """Return for each stamp a function that reads its image message.
 
         A chunk whose only message of the stream was logged at its own stamp is found without being read;
         the others are read once.

@@ -1,4 +1,4 @@
-"""One MCAP file, read with whatever is left of it.
+"""Read one MCAP file as far as it is intact.
 
 The libraries' readers give up on a file at its first damage. This one reads through the index when
 there is a sound one, otherwise walks the records from the start and makes its own, checks every checksum that
@@ -43,7 +43,7 @@ _PIECE = 1 << 20
 
 @dataclass(frozen=True)
 class Place:
-    """Where messages lie in a file: a chunk, or a message outside of chunks.
+    """Position of messages in a file: a chunk, or a message outside chunks.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ class McapFile:
             yield offset, op, body
 
     def segments(self, wanted: Callable[[TopicType], bool]) -> list[Segment]:
-        """Return where the messages of the wanted channels lie; data are views of what holds them."""
+        """Return the positions of the wanted channels' messages, as views without copies."""
         chosen = {i for i, c in self.channels.items() if wanted(c)}
 
         def reading(place: Place) -> Callable[[], Iterator[RawMessage]]:
@@ -293,7 +293,7 @@ class McapFile:
         return [(p.start_ns, reading(p)) for p in self.places if p.channels & chosen]
 
     def messages_of(self, place: Place, channels: set[int]) -> Iterator[RawMessage]:
-        """Iterate the messages of one place in time order, and read none of the others.
+        """Iterate the messages of one place in time order, without reading others.
 
         None if it is damaged, which is complained of.
         """

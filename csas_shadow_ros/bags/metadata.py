@@ -1,4 +1,4 @@
-"""metadata.yaml of a rosbag2 directory, read within bounds: it only lists what the files themselves tell."""
+"""Read metadata.yaml of a rosbag2 directory within bounds; the files themselves count."""
 
 from __future__ import annotations
 

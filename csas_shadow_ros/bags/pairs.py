@@ -1,4 +1,4 @@
-"""Messages of a bag, checked and paired by stamp; what is wrong with them has a place and a reason."""
+"""Messages of a bag, checked and paired by stamp; problems carry a place and a reason."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .bag import BagMessage, BagReader
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong in a bag.
+    """One fault of a bag.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class MessagePair:
-    """An image and its camera_info, decoded but not checked, and both as they were recorded."""
+    """An image and its camera_info, decoded but not checked, with the recorded bytes of both."""
 
     topic: str
     number: int
@@ -60,7 +60,7 @@ class MessagePair:
 def checked_messages(
     reader: BagReader, relative: str, report: Callable[[Problem], None], *, repeated: bool = False
 ) -> Iterator[tuple[BagMessage, Any, int]]:
-    """Iterate (message, decoded, stamp) of a topic; a stamp that comes again is passed over.
+    """Iterate (message, decoded, stamp) of a topic; skip repeated stamps.
 
     A latched message may be recorded several times: the same stamp with the same bytes counts once,
     with other bytes it is reported. With `repeated` it is another message: a Path that grows may keep its

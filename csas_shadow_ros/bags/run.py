@@ -53,7 +53,7 @@ IN_MEMORY = Path("in memory")
 
 @dataclass
 class Run:
-    """What a bag holds of a run.
+    """A run as a bag holds it.
 
     The full-circle image and the track are read at once, views and sectors as they are iterated. A
     message that breaks the contract is left out and is one entry of `problems`.
@@ -96,7 +96,7 @@ class Run:
 
     @classmethod
     def of(cls, image: CoherentImage, track: Track) -> Run:
-        """Make a run of an image and a track that are in memory, without a bag.
+        """Make a run from an image and a track in memory, without a bag.
 
         Parameters
         ----------
@@ -151,7 +151,7 @@ class Run:
         return self._each("sector", sector_from_msgs)
 
     def sector_infos(self) -> list[SectorInfo]:
-        """Return what the legible sectors say of themselves, each stamp once; read once, without pixels."""
+        """Return the legible sectors' infos, each stamp once, read once without pixels."""
         if self._infos is None:
             self._infos = []
             if self._reader is not None:
@@ -164,7 +164,7 @@ class Run:
         return self._infos
 
     def sector_sum(self) -> SectorSum:
-        """Return the sum of the sectors; it is made once.
+        """Return the sum of the sectors, computed once.
 
         Raises
         ------
@@ -226,7 +226,7 @@ class Run:
         return self.track
 
     def why(self, lack: str) -> str:
-        """Say what is lacking, with the first problem as its reason."""
+        """Say what is missing, with the first problem as the reason."""
         # Damage of the bag itself explains what else is missing.
         problems = sorted(self.problems, key=lambda problem: problem.topic != "")
         found = f": {problems[0]}" if problems else ""
@@ -235,7 +235,7 @@ class Run:
         return f"{self.path}: {lack}{found}{more}"
 
     def decision(self) -> Decision | None:
-        """Return what the bag's views were made for, as topic `search` or `target` tells; None if neither."""
+        """Return the decision behind the bag's views, from topic `search` or `target`; None if neither."""
         # Late: it needs the method, which readers of messages need not load.
         from csas_shadow_ros.core.search.decision import Decision
         from csas_shadow_ros.core.shape.volume import Target
@@ -280,13 +280,13 @@ class Run:
             self.report(Problem(topic, None, None, f"{self._runs.not_covered(what)}; they are skipped"))
 
     def report(self, problem: Problem) -> None:
-        """Note a problem; the same one only once."""
+        """Record a problem, each only once."""
         if problem not in self.problems:
             self.problems.append(problem)
 
 
 def odd_sectors(infos: Iterable[SectorInfo]) -> dict[int, str]:
-    """Return, by stamp, why a sector is not like most: one that is wrong must not make the others wrong."""
+    """Return, by stamp, how a sector differs from most, so that a wrong one spoils no other."""
     return sectors_of_one_run(infos)[0]
 
 
@@ -304,7 +304,7 @@ def _kinds_of(infos: Iterable[SectorInfo]) -> list[list[SectorInfo]]:
 
 
 def sectors_of_one_run(infos: Iterable[SectorInfo]) -> tuple[dict[int, str], GroundGrid | None]:
-    """Return what is wrong with the odd ones, by stamp, and the lattice that the rest add up on."""
+    """Return the faults of odd sectors, by stamp, and the lattice of the rest's sum."""
     kinds = _kinds_of(infos)
     if not kinds:
         return {}, None
@@ -444,7 +444,7 @@ def write_run(
     extra: Iterable[tuple[str, Any]] = (),
     datum: Datum | None = None,
 ) -> Path:
-    """Write a run as a rosbag2 directory that any ROS 2 tool opens.
+    """Write a run as a rosbag2 directory that any ROS 2 tool can open.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""One sqlite3 storage file of rosbag2, read with whatever a killed recorder left beside it.
+"""Read one sqlite3 storage file of rosbag2, including a killed recorder's leftovers beside it.
 
 Format: https://github.com/ros2/rosbag2/tree/jazzy/rosbag2_storage_sqlite3. Only plain tables are read: a view
 or a computed column can make any number of messages out of nothing.
@@ -132,7 +132,7 @@ class SqliteFile:
             yield row, number, when
 
     def segments(self, wanted: Callable[[TopicType], bool]) -> list[Segment]:
-        """Return where the messages of the wanted channels lie: one segment a file."""
+        """Return the positions of the wanted channels' messages: one segment per file."""
         chosen = [i for i, c in self.channels.items() if i in self._rows and wanted(c)]
         if not chosen:
             return []

@@ -1,4 +1,4 @@
-"""What every storage file is held to before memory is taken for it, and how messages of several merge."""
+"""Bounds of storage files, checked before memory is taken, and merging of several files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _PIECE = 1 << 20
 
 
 class RawMessage(NamedTuple):
-    """A message as it lies in the file."""
+    """A message as stored in the file."""
 
     channel_id: int
     log_time_ns: int
@@ -70,12 +70,12 @@ class StorageFile(Protocol):
     has_checksums: bool
 
     def segments(self, wanted: Callable[[TopicType], bool]) -> list[Segment]:
-        """Return where the messages of the wanted channels lie."""
+        """Return the positions of the wanted channels' messages."""
         ...
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a file for reading; one that has no end or no content of its own is refused, not waited for.
+    """Open a regular file for reading; refuse devices and pipes instead of waiting for them.
 
     Raises
     ------
@@ -95,12 +95,12 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def most_unfolded(stored: int) -> int:
-    """Return to how many bytes stored data may unfold."""
+    """Return the largest size, in bytes, to which stored data may unfold."""
     return min(max(_FREE_BYTES, MOST_EXPANSION * stored), _MOST_BYTES)
 
 
 def refuse_expansion(size: int, stored: int) -> None:
-    """Refuse data that would unfold to more than any recording does.
+    """Refuse data that unfold to more than any recording would.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def refuse_expansion(size: int, stored: int) -> None:
 
 
 def unfold(data: memoryview, compression: str, size: int) -> memoryview:
-    """Decompress data that are said to unfold to a size, and never take more memory than that.
+    """Decompress data of a declared size, never using more memory than that.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def unfold(data: memoryview, compression: str, size: int) -> memoryview:
 
 
 def unfold_message(data: memoryview) -> memoryview:
-    """Decompress a message of rosbag2's compression mode MESSAGE; others are returned as they are.
+    """Decompress a message of rosbag2's compression mode MESSAGE; return others unchanged.
 
     The data tell: CDR begins with a zero, zstd never does. metadata.yaml may have been lost or edited.
 
@@ -167,7 +167,7 @@ def unfold_message(data: memoryview) -> memoryview:
 
 
 def unfold_file(path: Path, compression: str, into: Path, complain: Callable[[str], None]) -> bool:
-    """Decompress a file of rosbag2's compression mode FILE as far as it goes; say whether it went to its end.
+    """Decompress a file of rosbag2's compression mode FILE as far as possible; say whether it is complete.
 
     Raises
     ------
@@ -210,7 +210,7 @@ def _lz4_pieces(source: BinaryIO) -> Iterator[bytes]:
 
 
 def merged(files: list[StorageFile], wanted: Callable[[TopicType], bool]) -> Iterator[tuple[int, RawMessage]]:
-    """Iterate (file's number, message) in time order, whatever the order of files and of parts in them.
+    """Iterate (file number, message) in time order, for any order of files and of their parts.
 
     A segment is read when its time has come: only those that overlap in time are in memory together.
     """

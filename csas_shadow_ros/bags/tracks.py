@@ -1,4 +1,4 @@
-"""The runs of a bag: what its Paths, merged, cover in time, and which run is to be processed."""
+"""The runs of a bag: time spans of its merged Paths, and the run to process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MAX_RUNS = 1 << 20
 
 
 class BagRuns:
-    """The runs of a bag, and the one of them that is looked at.
+    """The runs of a bag, and the selected one.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class BagRuns:
         return f": {', '.join(held)}" if held else ": no images"
 
     def covers(self, stamp_ns: int) -> bool:
-        """Say whether a stamp is of the run that is looked at; without tracks everything is."""
+        """Say whether a stamp is of the selected run; without tracks every stamp is."""
         return self.name is None or self.name in self.book.runs_of(stamp_ns)
 
     def is_of_another(self, stamp_ns: int) -> bool:
@@ -117,7 +117,7 @@ class BagRuns:
         return not self.covers(stamp_ns) and bool(self.book.runs_of(stamp_ns))
 
     def not_covered(self, what: str = "its stamp") -> str:
-        """Say that no track covers a stamp, and what the tracks cover."""
+        """State that no track covers a stamp, and what the tracks cover."""
         spans = [self.book.span(name) for name in self.names]
         named = ", ".join(f"{first} to {last} ns" for first, last in spans[:4])
         named += f" and {len(spans) - 4} more" if len(spans) > 4 else ""
@@ -136,7 +136,7 @@ class BagRuns:
         return SCENE_FRAME
 
     def origin(self, report: Callable[[Problem], None]) -> tuple[Origin, bytes] | None:
-        """Return what topic origin says of the place of this run's frame, and the message as recorded."""
+        """Return the origin of this run's frame from topic origin, and the recorded message."""
         said: list[tuple[Origin, bytes]] = []
         for message, decoded, stamp in checked_messages(self._reader, "origin", report, repeated=True):
             try:
@@ -152,7 +152,7 @@ class BagRuns:
         return next((one for one in said if one[0] is chosen), None)
 
     def doubt(self, stamp_ns: int) -> str | None:
-        """Say that several tracks cover a stamp; None if not."""
+        """State that several tracks cover a stamp; None if not."""
         runs = self.book.runs_of(stamp_ns)
         if len(runs) < 2:
             return None
@@ -180,7 +180,7 @@ class BagRuns:
     def track(
         self, image_ns: int | None, infos: Sequence[SectorInfo]
     ) -> tuple[Track | None, tuple[str, ...]]:
-        """Return the passage that counts and what is to be said of it; None and why if there is none."""
+        """Return the passage that counts and notes on it; None and the reason if there is none."""
         if self.name is None:
             return None, ()
         named = infos or ([] if image_ns is not None else self._view_infos())

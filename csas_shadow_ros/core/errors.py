@@ -28,7 +28,7 @@ class InputTypeError(CsasError, TypeError):
 
 
 class NoTargetError(CsasError, ValueError):
-    """A target was needed and neither given nor found."""
+    """A required target was neither given nor found."""
 
 
 class SpectrumSignError(CsasError, ValueError):
@@ -54,11 +54,11 @@ class AdapterError(CsasError, ValueError):
 
 
 class BagError(CsasError, ValueError):
-    """A bag cannot be read or does not honour the contract."""
+    """A bag cannot be read or breaks the contract."""
 
 
 class MissingExtraError(CsasError, ImportError):
-    """A library that only one function needs is not installed; the message names the extra that brings it."""
+    """A library of one function is not installed; the message names the extra that brings it."""
 
 
 def check_type(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:

@@ -1,4 +1,4 @@
-"""Compiled kernels, and where they are kept: compiled once a machine, wherever that can be written.
+"""Compiled kernels and their folder: compiled once per machine, in the first writable place.
 
 Compiling them all takes most of a minute. numba keeps what it compiled beside a module or in the user's
 cache, refuses to import a module where it can write neither, and does not read where it cannot write: what
@@ -53,7 +53,7 @@ class Place:
 
 
 def package_folder() -> Path:
-    """Return where kernels are kept if the package's folder can be written."""
+    """Return the kernels' folder inside the package, used if it is writable."""
     return Path(__file__).resolve().parents[1] / "__pycache__" / "kernels"
 
 
@@ -106,7 +106,7 @@ def _bring(source: Path, target: Path) -> None:
 
 @functools.cache
 def place() -> Place:
-    """Choose where kernels are kept: NUMBA_CACHE_DIR, package, user cache or temporary folder.
+    """Choose the kernels' folder: NUMBA_CACHE_DIR, package, user cache or temporary folder.
 
     A place other than the first two is said when it is made; that there is none, by every process.
 
@@ -146,7 +146,7 @@ def _numba_keeps_in(folder: Path) -> Iterator[None]:
 
 
 def kernel(**options: Any) -> Callable[[Function], Function]:
-    """Compile a function when it is first called, without the interpreter lock, and keep it.
+    """Compile a function at its first call, without the interpreter lock, and cache it.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def kernel(**options: Any) -> Callable[[Function], Function]:
 
 
 def counts() -> tuple[int, int]:
-    """Return how many kernels this process loaded, and how many it compiled; variants of one count."""
+    """Count the kernels that this process loaded and compiled, variants included."""
     stats = [k.stats for k in KERNELS]
     loaded = sum(sum(s.cache_hits.values()) for s in stats)
     return loaded, sum(sum(s.cache_misses.values()) for s in stats)

@@ -1,4 +1,4 @@
-"""Start later in the chain: the method on views that were made elsewhere, at any stage.
+"""Start later in the chain: the method on views from elsewhere, at any stage.
 
 A bag may hold no image, but views of some stage: sub-apertures of another processor, shadow views that
 an outside enhancement made, likelihoods of an outside classifier, silhouettes that were drawn by hand. What
@@ -116,6 +116,6 @@ def check_method(stage: str, parameters: PipelineParameters) -> None:
 
 
 def with_spectrum_sign(view: View, spectrum_sign: int) -> View:
-    """Return a view whose stated spectrum sign is replaced."""
+    """Return the view with another stated spectrum sign."""
     acoustics = replace(view.info.acoustics, spectrum_sign=spectrum_sign)
     return replace(view, info=replace(view.info, acoustics=acoustics))

@@ -106,7 +106,7 @@ class Parameters:
             object.__setattr__(self, name, checked)
 
     def check(self) -> None:
-        """Check what belongs together; each field has its own bounds, and was checked when it was made.
+        """Check that fields fit together; each field's own bounds were checked at construction.
 
         Raises
         ------
@@ -116,7 +116,7 @@ class Parameters:
 
     @classmethod
     def from_mapping(cls: type[P], values: Mapping[str, Any]) -> P:
-        """Make a parameter set from a mapping, such as a report's; unknown names are refused.
+        """Make a parameter set from a mapping, such as a report's; refuse unknown names.
 
         Raises
         ------
@@ -312,7 +312,7 @@ class PlaceParameters(Parameters):
     )
 
     def check(self) -> None:
-        """Refuse half a place."""
+        """Refuse a latitude without a longitude, or the reverse."""
         super().check()
         if math.isnan(self.origin_lat_deg) != math.isnan(self.origin_lon_deg):
             given, lacking = ("lat", "lon") if math.isnan(self.origin_lon_deg) else ("lon", "lat")
@@ -320,7 +320,7 @@ class PlaceParameters(Parameters):
 
     @property
     def given(self) -> bool:
-        """Whether they say where the origin is, so that nobody else is asked."""
+        """Whether they state the origin, which then overrides topic origin."""
         return not math.isnan(self.origin_lat_deg)
 
     def datum(self, said: Datum | None = None) -> Datum | None:
@@ -357,7 +357,7 @@ STAGES: dict[str, type[Parameters]] = {
 
 @dataclass(frozen=True)
 class PipelineParameters:
-    """Parameters of the whole chain, one set a stage."""
+    """Parameters of the whole chain, one set per stage."""
 
     sub_aperture: SubApertureParameters = dataclasses.field(default_factory=SubApertureParameters)
     shadow: ShadowParameters = dataclasses.field(default_factory=ShadowParameters)

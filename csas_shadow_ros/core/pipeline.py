@@ -30,7 +30,7 @@ from .shape.volume import Target
 
 
 class ProcessedView:
-    """One view on its way through the stages: what is asked for is made of what is there, once.
+    """One view on its way through the stages: each stage is computed once, when first requested.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class ProcessedView:
         self.__dict__.update({stage.removeprefix("shadow_"): view for stage, view in given.items()})
 
     def require(self, part: str) -> Any:
-        """Return a part, or raise a ViewError where what is there does not tell it."""
+        """Return a part, or raise a ViewError if its input is missing."""
         if (made := getattr(self, part)) is None:
             raise ViewError(f"a view's {part} cannot be made: its input is missing")
         return made
@@ -85,14 +85,14 @@ class ProcessedView:
 
     @cached_property
     def sides(self) -> SilhouetteSides | None:
-        """Where the silhouette ends, to a fraction of a pixel (beyond the paper: dimensions)."""
+        """Edges of the silhouette, to a fraction of a pixel (beyond the paper: dimensions)."""
         if self.levels is None or self.mask is None or self.target is None:
             return None
         return silhouette_sides(self.levels, self.mask, self.target.position_m)
 
     @cached_property
     def look(self) -> EchoLook | None:
-        """Where the view is dark round the target (beyond the paper: hollows)."""
+        """Dark pixels of the view round the target (beyond the paper: hollows)."""
         if self.levels is None or self.shadow is None or self.target is None:
             return None
         volume = self.target.volume(self.p.carving.voxel_size_m)
@@ -100,7 +100,7 @@ class ProcessedView:
 
 
 def process(view: View, stage: str, decision: Decision, p: PipelineParameters) -> list[ProcessedView]:
-    """Take one view from its stage on, for every body: the target; from sub-apertures the others, too."""
+    """Process one view from its stage on, for the target and, from sub-apertures, the other bodies."""
     bodies = (decision.target, *(decision.others if stage == "sub_aperture" else ()))
     return [ProcessedView(body, p, **{stage: view}) for body in bodies]
 
@@ -117,7 +117,7 @@ def run(
     spectrum: Spectrum | None = None,
     run_ns: int | None = None,
 ) -> Result:
-    """Reconstruct the target of a circular run, and what else stands there, from their shadows.
+    """Reconstruct the target of a circular run, and further objects, from their shadows.
 
     `progress` is called with (views done, views in all), `on_view` with every view in order of aspect. At
     most `max_objects` bodies are carved, each knowing where the others' echoes lie. `spectrum` is the

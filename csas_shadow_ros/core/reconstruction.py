@@ -1,4 +1,4 @@
-"""The one thing that views are fed to: it carves, and says what there is.
+"""The consumer of all views: it carves, and states the result.
 
 `pipeline.run`, runs from views or sectors, and node `voxel_carver` all feed a `Reconstruction`, view by view,
 in any order, whole views or the parts of one as they come. Sums are of whole numbers, and what is measured
@@ -60,7 +60,7 @@ _WAITING = 16
 
 
 class Body:
-    """One body while it is carved.
+    """One body during carving.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class Body:
         self._waiting: OrderedDict[int, Levels] = OrderedDict()
 
     def add(self, view: ProcessedView, parts: Collection[str]) -> bool:
-        """Take parts of a view in; say whether it is new to the grid.
+        """Add parts of a view; say whether it is new to the grid.
 
         Raises
         ------
@@ -153,7 +153,7 @@ class Body:
                 self._waiting.popitem(last=False)
 
     def shape(self) -> tuple[VoxelGrid, VoxelGrid | None]:
-        """Return what carving leaves, and what the other method leaves if it was asked for.
+        """Return the carved grid, and the other method's if requested.
 
         Thin and faint bodies are too little for silhouettes and still darken the mean of all views, by which
         the search finds them. Where silhouettes leave nothing, that mean tells what is there.
@@ -164,7 +164,7 @@ class Body:
     def beside(
         self, alone: tuple[VoxelGrid, VoxelGrid | None], others: Sequence[VoxelGrid]
     ) -> tuple[VoxelGrid, VoxelGrid | None]:
-        """Return the same as `shape`, which gave `alone`, knowing what else stands there."""
+        """Return `shape` again, given `alone` and the other bodies."""
         told, other = alone
         if other is not None and told.method != self.carver.parameters.method:
             told, other = other, told
@@ -196,7 +196,7 @@ def _measured(
 
 
 class Reconstruction:
-    """A scene while its views come in.
+    """A scene during the arrival of its views.
 
     Parameters
     ----------
@@ -247,12 +247,12 @@ class Reconstruction:
         return self.bodies[0].carver.stamps if self.bodies else set()
 
     def parts_of(self, number: int) -> tuple[str, ...]:
-        """Return what of a view is needed for a body: of those besides the target no hollows are told."""
+        """Return the parts of a view that a body needs; only the target needs those for hollows."""
         taken = "mask" if self.parameters.carving.takes_masks else "likelihood"
         return PARTS if number == 0 else tuple(dict.fromkeys((taken, "mask", "levels", "sides")))
 
     def add(self, view: ProcessedView, body: int = 0, parts: Collection[str] = PARTS) -> bool:
-        """Take a view in, or some parts of one; say whether it is new to the body's grid.
+        """Add a view, or some parts of one; say whether it is new to the body's grid.
 
         Raises
         ------
@@ -284,11 +284,11 @@ class Reconstruction:
             )
 
     def settle(self, decision: Decision) -> None:
-        """Take the whole run's decision for a provisional one that carves the same volumes."""
+        """Replace a provisional decision by the whole run's, for the same volumes."""
         self.decision = decision
 
     def refuse(self, aspect_rad: float, reason: str) -> None:
-        """Note that a view could not be used."""
+        """Record a view that could not be used."""
         self.rejected[round(math.degrees(aspect_rad), 6)] = reason
 
     def feed(
@@ -301,7 +301,7 @@ class Reconstruction:
         on_view: Callable[[ProcessedView], None] | None = None,
         workers: int = 2,
     ) -> int:
-        """Process views in threads and take them in, in order.
+        """Process views in threads and add them in order.
 
         Parameters
         ----------
@@ -377,7 +377,7 @@ class Reconstruction:
                     self.refuse(aspect_rad, str(error))
 
     def add_others(self, views: Sequence[ProcessedView]) -> None:
-        """Take a view in for the bodies besides the target (the first), whose own comes another way."""
+        """Add a view for all bodies except the target, which receives its own separately."""
         for number, view in enumerate(views[: len(self.bodies)]):
             if number:
                 try:
@@ -394,7 +394,7 @@ class Reconstruction:
         self.composites.integrate(view)
 
     def result(self, *, final: bool = True) -> Result:
-        """Say what there is.
+        """Return the result so far.
 
         Parameters
         ----------

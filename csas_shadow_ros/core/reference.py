@@ -322,7 +322,7 @@ def covered_pixels(
     target_m: tuple[float, float],
     reach_m: float,
 ) -> NDArray[np.bool_]:
-    """Mark what lies between the target's echo and its shadow, column by column.
+    """Mark the pixels between the target's echo and its shadow, column by column.
 
     It reaches from the farthest echo within reach of the target to the shadow. A side along range, g long, is
     smeared by g/2 tan(w/2) to either side by the aperture w: a stretch of shadow that lies no farther inside
@@ -474,7 +474,7 @@ def values_at_shadows(images: Sequence[View], volume: Volume) -> NDArray[np.floa
 
 
 def outside_silhouette(mask: View) -> View:
-    """Say of each pixel of a silhouette: 1 outside it, 0 inside, NaN where it is unknown or covered."""
+    """Map a silhouette to 1 outside, 0 inside, NaN where it is unknown or covered."""
     pixels = np.full(mask.pixels.shape, np.nan)
     pixels[mask.pixels == OUTSIDE] = 1.0
     pixels[mask.pixels == SHADOW] = 0.0
@@ -482,7 +482,7 @@ def outside_silhouette(mask: View) -> View:
 
 
 def hard_carving(masks: Sequence[View], volume: Volume) -> NDArray[np.bool_]:
-    """Carve with silhouettes (section 4.1): what one view sees outside is removed.
+    """Carve with silhouettes (section 4.1): remove every voxel outside one view's silhouette.
 
     Parameters
     ----------

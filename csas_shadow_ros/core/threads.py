@@ -12,7 +12,7 @@ Out = TypeVar("Out")
 
 
 def in_order(function: Callable[[In], Out], items: Iterable[In], workers: int) -> Iterator[tuple[In, Out]]:
-    """Apply a function in threads, at most a few items ahead, and give the results in order."""
+    """Apply a function in threads, at most a few items ahead, and yield the results in order."""
     waiting: deque[tuple[In, Future[Out]]] = deque()
     with ThreadPoolExecutor(workers) as pool:
         for item in items:

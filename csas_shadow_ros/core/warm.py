@@ -84,7 +84,7 @@ def warm_enhancement() -> None:
 
 
 def warm_likelihood() -> None:
-    """Take a sample view through levels, likelihood and segmentation."""
+    """Process a sample view through levels, likelihood and segmentation."""
     for view in _both(_shadow_view()):
         made = _sample(shadow=view)
         for part in ("levels", "likelihood", "mask"):
@@ -92,7 +92,7 @@ def warm_likelihood() -> None:
 
 
 def warm_carving(parameters: CarvingParameters | None = None) -> None:
-    """Carve a few voxels with a sample view by a method, and look at them as at the end of a run."""
+    """Carve a few voxels with a sample view by a method, and finish them as at the end of a run."""
     from .shape.carving import Carver
     from .shape.explained import count_shadow_pixels
     from .shape.hollows import matter_of
@@ -160,7 +160,7 @@ def warm_composites() -> None:
 
 
 def warm_all() -> None:
-    """Call every stage's kernels: compiled once, they are loaded from then on."""
+    """Call every stage's kernels, so that they are compiled or loaded."""
     warm_sub_apertures()
     warm_enhancement()
     warm_likelihood()

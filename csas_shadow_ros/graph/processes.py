@@ -1,4 +1,4 @@
-"""The processes of a node graph: started, watched, started again, ended by their ids."""
+"""The processes of a node graph: starts, watches, restarts and ends them by their ids."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ _MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(1 << 26), "MALLOC_TRIM_THRESHOLD_": str
 
 
 class ReplayError(CsasError):
-    """The graph could not bring a replay to its end."""
+    """The graph could not finish a replay."""
 
 
 def config_file(name: str) -> Path:
@@ -91,7 +91,7 @@ def config_file(name: str) -> Path:
 
 
 class DomainReservation:
-    """A ROS domain that no other replay on this machine takes, until it is closed or its process ends.
+    """A ROS domain reserved on this machine until it is closed or its process ends.
 
     What holds it is a UDP port of the domain that no participant uses: whoever shares the participants' ports
     shares it too, users and containers alike, and it is free again whatever ends the process.
@@ -143,19 +143,19 @@ class DomainReservation:
         self.close()
 
     def close(self) -> None:
-        """Let others have it, after their processes' end; what killed ones left of it is removed."""
+        """Release the domain after the processes' end, and remove leftovers of killed ones."""
         if self._own and self._held.fileno() >= 0 and unused(self.domain_id):
             remove_ports(self.domain_id)
         self._held.close()
 
 
 def new_graph_id() -> str:
-    """Return an identity for a graph: its nodes' messages carry it, and its nodes refuse another's."""
+    """Return an identity for a graph, which its nodes' messages carry."""
     return uuid.uuid4().hex[:12]
 
 
 def graph_environment(domain_id: int, log_dir: Path, graph_id: str = "") -> dict[str, str]:
-    """Return the environment of the graph's processes: this machine alone, shared memory, few threads."""
+    """Return the environment of the graph's processes: local discovery, shared memory, few threads."""
     own = {
         GRAPH_ID: graph_id,
         "ROS_DOMAIN_ID": str(domain_id),
@@ -180,7 +180,7 @@ _environment_lock = threading.Lock()
 
 @contextlib.contextmanager
 def environment_of(values: Mapping[str, str]) -> Iterator[None]:
-    """Have these variables set for a while; one thread at a time."""
+    """Set environment variables temporarily; one thread at a time."""
     with _environment_lock:
         before = {name: os.environ.get(name) for name in values}
         os.environ.update(values)
@@ -196,7 +196,7 @@ def environment_of(values: Mapping[str, str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def signals_deferred() -> Iterator[None]:
-    """Hold back what signals raise: a participant that is half made could not be taken away again."""
+    """Defer exceptions from signals, so that no participant stays half made."""
     if threading.current_thread() is not threading.main_thread():
         yield  # no signal is handled here
         return
@@ -271,7 +271,7 @@ def _exists(pid: int) -> bool:
 
 
 class ForkServer:
-    """Starts node processes from one that has loaded what they all need (`nodes.runtime.fork_server`).
+    """Forks node processes from one with their common modules loaded (`nodes.runtime.fork_server`).
 
     Parameters
     ----------
@@ -313,7 +313,7 @@ class ForkServer:
         return self._server.pid
 
     def start(self, node: str, arguments: Sequence[str], log: Path) -> Future[int]:
-        """Have a node started; its process id, or an error, will follow."""
+        """Request the start of a node; its process id, or an error, follows."""
         answer: Future[int] = Future()
         request = json.dumps({"node": node, "arguments": list(arguments), "log": str(log)})
         assert self._server.stdin is not None
@@ -353,11 +353,11 @@ class ForkServer:
         self.close()
 
     def kill(self) -> None:
-        """End the server at once, which does not answer."""
+        """Kill a server that does not answer."""
         self._server.kill()
 
     def end(self) -> None:
-        """End the server: requests that it has not begun with fail, the processes that it made run on."""
+        """End the server: pending requests fail, its processes run on."""
         if self._server.poll() is None:
             self._server.terminate()
         with self._lock, contextlib.suppress(OSError):
@@ -370,7 +370,7 @@ class ForkServer:
         self._reader.join()
 
     def close(self) -> None:
-        """End the server, and take in no more orphans."""
+        """End the server, and adopt no more orphans."""
         try:
             self.end()
         except BaseException:
@@ -386,7 +386,7 @@ class ForkServer:
 def start_fork_server(
     domain_id: int, log_dir: Path, graph_id: str = ""
 ) -> contextlib.AbstractContextManager[ForkServer | None]:
-    """Start a fork server for a graph; None where the system has no such thing.
+    """Start a fork server for a graph; None if the system has none.
 
     Parameters
     ----------
@@ -451,7 +451,7 @@ _orphans = _Orphans()
 
 
 class GraphProcess:
-    """One node's process: started, watched, started again, ended by its id.
+    """One node's process: starts, watches, restarts and ends it by its id.
 
     Parameters
     ----------
@@ -501,7 +501,7 @@ class GraphProcess:
         return self._process.pid
 
     def start(self) -> None:
-        """Start the process, or start it again."""
+        """Start or restart the process."""
         self.restarts += 1
         self._process = None
         if self._server is None:
@@ -591,7 +591,7 @@ class GraphProcess:
 
 
 class Graph:
-    """The processes of a graph; ends them all when left.
+    """The processes of a graph; leaving it ends them all.
 
     Parameters
     ----------
@@ -654,7 +654,7 @@ class Graph:
         self.stop()
 
     def watch(self) -> None:
-        """Start again what has died.
+        """Restart processes that have died.
 
         Raises
         ------
@@ -680,7 +680,7 @@ class Graph:
             remove_strays(self._began_s)
 
     def stop(self) -> None:
-        """End all processes: asked first, so that a recorder finishes its bag, then killed."""
+        """End all processes: first by request, so that a recorder finishes its bag, then by force."""
         try:
             if self._server is not None:
                 self._server.end()

@@ -23,7 +23,7 @@ class BagPlayerNode(CsasNode):
     name = "bag_player"
 
     def setup(self) -> None:
-        """Open the bag; begin to serve what is latched."""
+        """Open the bag and serve its latched topics."""
         if not self.parameters.bag:
             raise ParameterError("bag is ''; expected the path of a bag")
         self.reader = BagReader(self.parameters.bag, self.parameters.bag_namespace or None)
@@ -57,7 +57,7 @@ class BagPlayerNode(CsasNode):
     # Latched topics
 
     def latch(self, relative: str, cdr: Any = None) -> None:
-        """Publish one message of a topic for whoever comes; the bag's last one by default."""
+        """Latch one message of a topic, by default the bag's last one."""
         if cdr is None:
             for message in self.reader.messages([relative]):
                 cdr = message.cdr
@@ -65,7 +65,7 @@ class BagPlayerNode(CsasNode):
             self.publisher(relative, qos.LATCHED).publish(bytes(cdr))
 
     def latch_image(self) -> None:
-        """Publish the first usable image; an unusable one if there is no other, so that it gets named."""
+        """Latch the first usable image; if there is none, an unusable one, so that it is named."""
         found = self.reader.topic("image")
         alone = found is not None and found.count == 1 and len(self.runs.names) < 2
         chosen: MessagePair | None = None
@@ -87,14 +87,14 @@ class BagPlayerNode(CsasNode):
         self.latch("image", chosen.image_cdr)
 
     def latch_track(self) -> None:
-        """Publish all poses of the run that the bag's Paths hold, in one."""
+        """Latch all of the run's poses in the bag's Paths, as one message."""
         name = self.runs.name
         if name is not None:
             path = track_to_msg(self.messages, self.runs.book.track(name))
             self.publisher("track", qos.LATCHED).publish(path)
 
     def latch_origin(self) -> None:
-        """Publish what the bag says of the run's place on earth, as it was recorded."""
+        """Latch the run's place on earth as the bag recorded it."""
         said = self.runs.origin(self._problem)
         if said is not None:
             self.latch("origin", said[1])
@@ -105,7 +105,7 @@ class BagPlayerNode(CsasNode):
     # Time
 
     def start_clock(self) -> None:
-        """Publish, from now on, when what is played was recorded."""
+        """Start publishing the recording's time."""
         from rosgraph_msgs.msg import Clock
 
         publisher = self.own_publisher(Clock, "/clock", qos.CLOCK)
@@ -117,7 +117,7 @@ class BagPlayerNode(CsasNode):
         self.every(1.0 / self.parameters.clock_hz, tell)
 
     def recorded_ns(self) -> int:
-        """Return the recording's time at which playing is: a latched image's is the end of its run."""
+        """Return the present time of the recording; for a latched image the end of its run."""
         if self.views is None:
             return self._latched_ns
         times = self.views.times
@@ -146,7 +146,7 @@ class BagPlayerNode(CsasNode):
         return time.monotonic() >= self._due_s
 
     def state_values(self) -> dict[str, str]:
-        """Return for how long nothing happens because the next view's time has not come."""
+        """Return the remaining time until the next view is due."""
         wait_s = self._due_s - time.monotonic()
         return {"due_in_s": f"{wait_s:.1f}"} if wait_s > 0 and not self.source.flow.in_flight else {}
 

@@ -1,4 +1,4 @@
-"""Node `bag_recorder`: records the contract's topics into a bag, as they come, and loses no view."""
+"""Node `bag_recorder`: records the contract's topics into a bag and loses no view."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _latched_profile(topic: str) -> Any:
 
 
 class RecordingInlet(Inlet):
-    """The reports of a recorded stream of views: a sink, but only while somebody publishes the stream."""
+    """The reports on a recorded stream of views: a sink, but only while somebody publishes the stream."""
 
     def __init__(self, node: BagRecorderNode, stream: str) -> None:
         # No subscriptions of its own: the recorder's raw ones serve all topics alike.
@@ -68,18 +68,18 @@ class RecordingInlet(Inlet):
         self.stamps: dict[bool, set[int]] = {False: set(), True: set()}
 
     def wrote(self, stamp: int, *, is_info: bool) -> None:
-        """Note that one of a pair is in the bag; report the view once both are."""
+        """Note that one message of a pair is in the bag; report the view once both are."""
         self.stamps[is_info].add(stamp)
         if stamp in self.stamps[not is_info]:
             self.report(stamp, INTEGRATED)
 
     def report_taken_over(self) -> None:
-        """Report what is in the bag already."""
+        """Report the views that are already in the bag."""
         for stamp in sorted(self.stamps[False] & self.stamps[True]):
             self.report(stamp, INTEGRATED, **self._idle())
 
     def give_up_lonely(self) -> None:
-        """Nothing is kept that could be lonely."""
+        """Do nothing: no unpaired messages are kept here."""
 
 
 @dataclass(eq=False)
@@ -97,7 +97,7 @@ class RunBag:
 
 
 class BagRecorderNode(CsasNode):
-    """Records raw messages, a bag a run. A view counts as recorded once both its messages are written."""
+    """Records raw messages, one bag per run. A view is recorded once both its messages are written."""
 
     name = "bag_recorder"
     _lock: TextIO | None = None
@@ -108,7 +108,7 @@ class BagRecorderNode(CsasNode):
         super().__init__(**options)
 
     def setup(self) -> None:
-        """Open the bag, take over what a killed recorder left, and subscribe."""
+        """Open the bag, take over a killed recorder's messages, and subscribe."""
         p = self.parameters
         if not p.out:
             raise ParameterError("out is ''; expected the path of the bag to make")
@@ -387,7 +387,7 @@ class BagRecorderNode(CsasNode):
                 inlet.stamps[is_info].add(stamp)
 
     def on_activated(self) -> None:
-        """Report what a killed recorder had recorded already."""
+        """Report the views of a killed recorder."""
         if not self._bags:
             self.error = f"{self.parameters.out} is finished; clean up and configure again for another bag"
         for inlet in self.inlets:
@@ -395,20 +395,20 @@ class BagRecorderNode(CsasNode):
                 inlet.report_taken_over()
 
     def state_values(self) -> dict[str, str]:
-        """Return the run that is recorded, and into which bag."""
+        """Return the recorded run and its bag."""
         if not self._bags:
             return {}
         bag = self._bags[-1]
         return {"bag": str(bag.path)} | ({} if bag.run_ns is None else {"run": str(bag.run_ns)})
 
     def state_counts(self) -> dict[str, int]:
-        """Return of how many topics of a result the newest bag has messages."""
+        """Count the topics of a result with messages in the newest bag."""
         # Heartbeats ask from a thread of their own: a length can be read while the set grows.
         bags = self._bags[-1:]
         return {"result_topics": len(bags[0].results) if bags else 0}
 
     def tick(self) -> None:
-        """See to it that a crash costs little; record further objects' topics as they appear."""
+        """Flush the bag against a crash; record further objects' topics as they appear."""
         if self._bags and time.monotonic() - self._flushed_s > _FLUSH_S:
             self._flushed_s = time.monotonic()
             if self.unable:
@@ -427,7 +427,7 @@ class BagRecorderNode(CsasNode):
                     self._record(relative)
 
     def finish(self) -> None:
-        """Finish the bags: their metadata come last, and at once."""
+        """Finish the bags, with their metadata last."""
         if self._bags:
             self._place_again(0.0)
         for bag in list(self._bags):

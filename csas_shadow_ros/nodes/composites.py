@@ -61,13 +61,13 @@ class CompositesNode(CsasNode):
         return False
 
     def state_counts(self) -> dict[str, int]:
-        """Return how many views are in, and whether that is all."""
+        """Return the number of views in the images, and whether they are complete."""
         held = len(self.composites.stamps) if self.composites else 0
         complete = hasattr(self, "growing") and self.growing.complete
         return {"views": held, "complete": int(complete)}
 
     def work(self, image: Any, info: Any) -> str:
-        """Add one view; the first of another run begins anew."""
+        """Add one view; start afresh with the first view of another run."""
         view = view_from_msgs(image, info, "sub_aperture")
         run_ns = self.runs.run_of(view.info.stamp_ns)
         if run_ns is not None and run_ns != self.run_ns:
@@ -95,18 +95,18 @@ class CompositesNode(CsasNode):
         return INTEGRATED
 
     def on_source(self, beat: Heartbeat) -> None:
-        """Finish once the source says that every view is here."""
+        """Finish once the source says that every view has arrived."""
         if beat.values.get("stream") == "sub_aperture" and self.has_begun(beat):
             self.growing.source_says(self.inlet.instance in beat.values.get("finished_for", "").split())
             self.tick()
 
     def has_begun(self, beat: Heartbeat) -> bool:
-        """Say whether a source speaks of the run whose views are here, or of any where nobody names it."""
+        """Say whether a source speaks of the present run; without a name it speaks of any."""
         name = beat.values.get("run")
         return name is None or self.run_ns is None or name == str(self.run_ns)
 
     def tick(self) -> None:
-        """Publish what has changed."""
+        """Publish the changes."""
         before = self.growing.complete
         self.growing.set_rate(self.parameters.publish_hz)
         self.growing.tick(time.monotonic())
@@ -114,11 +114,11 @@ class CompositesNode(CsasNode):
             self.tell_now()
 
     def wanted(self) -> bool:
-        """Say whether anybody looks at unfinished images."""
+        """Say whether anybody subscribes to unfinished images."""
         return any(image.get_subscription_count() for _, image in self.pictures.values())
 
     def publish_result(self) -> None:
-        """Publish both images as they are."""
+        """Publish both images in their present state."""
         if self.composites is None or self.acoustics is None:
             return
         newest_ns = max(self.composites.stamps)

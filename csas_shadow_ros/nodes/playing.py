@@ -1,4 +1,4 @@
-"""Reading bags for playing: which stage, and its raw pairs by stamp. No ROS needed."""
+"""Read bags for playing: which stage, and its raw pairs by stamp. No ROS needed."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def holds(reader: BagReader, relative: str) -> bool:
 
 
 def topics_to_record(topics: str) -> list[str]:
-    """Return the topics that the recorder's parameter names.
+    """Return the topics named by the recorder's parameter.
 
     Raises
     ------
@@ -83,14 +83,14 @@ def topics_to_record(topics: str) -> list[str]:
 
 
 def recorded_streams(topics: str) -> list[str]:
-    """Return the streams of which a recorder of these topics keeps both image and camera_info."""
+    """Return the streams with both image and camera_info among these topics."""
     names = set(topics_to_record(topics))
     flowing = [stream_of(name) for name in (*VIEW_STREAMS, "sector")]
     return [s.name for s in flowing if {s.image_topic, s.info_topic} <= names]
 
 
 def stage_of_bag(reader: BagReader, wanted: str = "auto") -> str:
-    """Return what to play: the earliest stage that the bag holds whole, unless one is named.
+    """Return the stage to play: the named one, or the earliest that is complete in the bag.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def stage_of_bag(reader: BagReader, wanted: str = "auto") -> str:
 
 
 def schedule(times: Mapping[int, int]) -> tuple[dict[int, float], list[str]]:
-    """Say when each view is played at the recorded speed, and what of the recording's clock is not followed.
+    """Schedule views at the recorded speed, and list the clock steps that are not followed.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def schedule(times: Mapping[int, int]) -> tuple[dict[int, float], list[str]]:
 
 
 class BagViews:
-    """The pairs of one stream of a bag, by stamp, at will: raw, and without holding more than a few.
+    """Random access by stamp to the raw pairs of one stream of a bag, with only a few in memory.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ class BagViews:
             return None
 
     def get(self, stamp: int) -> tuple[bytes, bytes]:
-        """Return (image, camera_info) as they were recorded.
+        """Return the recorded (image, camera_info).
 
         Reading goes on from where it was: views asked for in the order of recording are read once.
 

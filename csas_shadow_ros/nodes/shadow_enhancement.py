@@ -18,12 +18,12 @@ from .runtime.params import part
 
 
 class ShadowEnhancementNode(CsasNode):
-    """Takes `sub_aperture/*`, publishes `shadow/*`; pictures of it on `shadow/display` to those who look."""
+    """Takes `sub_aperture/*`, publishes `shadow/*`, and pictures on `shadow/display` if subscribed."""
 
     name = "shadow_enhancement"
 
     def setup(self) -> None:
-        """Make the outlet before the inlet: what comes in can go out."""
+        """Make the outlet before the inlet, so that input can go out."""
         self.pipeline = PipelineParameters(shadow=part(self.parameters, ShadowParameters))
         self.shadow = ViewOutlet(self, "shadow")
         self.display = self.publisher("shadow/display", qos.VIEWS)
@@ -36,7 +36,7 @@ class ShadowEnhancementNode(CsasNode):
         warm_enhancement()
 
     def waiting(self) -> str:
-        """Say so if views wait for the target."""
+        """Say if views wait for the target."""
         return self.target.missing() if self.inlet.held else ""
 
     def work(self, image: Any, info: Any) -> str:

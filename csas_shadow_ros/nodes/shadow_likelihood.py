@@ -1,4 +1,4 @@
-"""Node `shadow_likelihood`: how likely pixels lie outside the shadow, and the silhouette (section 4)."""
+"""Node `shadow_likelihood`: likelihood of lying outside the shadow, and the silhouette (section 4)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class ShadowLikelihoodNode(CsasNode):
         self.mask = None
 
     def waiting(self) -> str:
-        """Say so if no masks can be made."""
+        """Say if no masks can be made."""
         missing = self.target.missing()
         return f"{missing}; likelihood only, no masks" if missing and self.counts["in"] else ""
 

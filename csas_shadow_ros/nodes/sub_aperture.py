@@ -59,7 +59,7 @@ _MOST_UNPLACED = 2
 
 @dataclass(eq=False)
 class Run:
-    """One circle of one contact, as far as it has come.
+    """One circle of one contact, so far.
 
     Parameters
     ----------
@@ -126,12 +126,12 @@ class SubApertureNode(CsasNode):
         self.aspects: dict[int, float] = {}
 
     def keeps_its_state(self) -> bool:
-        """Say yes once a run has begun; before, its image may have come while nothing was taken."""
+        """Return True once a run has begun; before that, its image may have been missed."""
         return bool(self.runs or self.over)
 
     @property
     def run(self) -> Run | None:
-        """The run whose views are sent."""
+        """The run now being sent."""
         return self.runs[0] if self.runs else None
 
     # What to say of it
@@ -163,7 +163,7 @@ class SubApertureNode(CsasNode):
         return f"waiting for more sectors ({arc:.0f}° are here)"
 
     def state_counts(self) -> dict[str, int]:
-        """Return how many sectors there are, how they came, the arc that they cover, and the runs."""
+        """Return the number of sectors and their irregularities, the covered arc, and the runs."""
         run = self.run
         state = {"sectors": 0, "runs_over": len(self.over), "runs_waiting": max(0, len(self.runs) - 1)}
         if run is None or run.image_stamp is not None:
@@ -180,11 +180,11 @@ class SubApertureNode(CsasNode):
     # Inputs
 
     def take_raw_image(self, cdr: bytes) -> None:
-        """Take the image as it was serialised."""
+        """Handle a serialised image."""
         self.take_image(message_from_cdr(cdr, TOPICS["image"].type_name, "image"), is_info=False)
 
     def take_image(self, msg: Any, *, is_info: bool) -> None:
-        """Take the image or its camera_info; the same one comes again when a player restarts."""
+        """Handle the image or its camera_info; a restarted player sends them again."""
         pair = self.pairer.add(msg, is_info=is_info)
         # A latched topic comes twice, by both subscriptions: its orphans are no news.
         self.pairer.orphans.clear()
@@ -193,7 +193,7 @@ class SubApertureNode(CsasNode):
             self.place_image(*pair, time.monotonic())
 
     def place_image(self, image: Any, info: Any, since_s: float) -> None:
-        """Give an image to the run whose track covers its stamp; one without such a track waits."""
+        """Assign an image to the run with a track over its stamp; without one it waits."""
         stamp = data_stamp_to_ns(image.header.stamp, "image.header.stamp")
         reason, patience_s = self.track.image_hold(stamp)
         if not reason:
@@ -231,7 +231,7 @@ class SubApertureNode(CsasNode):
         self.advancing.trigger()
 
     def take_track(self, name: int, renamed: dict[int, int]) -> None:
-        """Take what is known by now of a run's track."""
+        """Handle new poses of a run's track."""
         for run in self.runs:
             if run.name is not None:
                 run.name = renamed.get(run.name, run.name)
@@ -246,7 +246,7 @@ class SubApertureNode(CsasNode):
         self.advancing.trigger()
 
     def take_sector(self, image: Any, info: Any) -> str:
-        """Take one sector."""
+        """Handle one sector."""
         sector = sector_from_msgs(image, info)
         name = self.track.run_of(sector.stamp_ns)
         if name in self.over:
@@ -265,7 +265,7 @@ class SubApertureNode(CsasNode):
         return INTEGRATED
 
     def run_named(self, name: int | None, what: str) -> Run:
-        """Return a run that is not over, beginning it if need be."""
+        """Return a run that is not over, starting it if needed."""
         for run in self.runs:
             if run.name == name:
                 return run
@@ -295,7 +295,7 @@ class SubApertureNode(CsasNode):
         return run
 
     def give_track(self, run: Run) -> None:
-        """Give a run all of its poses that are known; say what of them does not count."""
+        """Give a run all of its known poses; log those that do not count."""
         if run.name is None:
             return
         try:
@@ -306,7 +306,7 @@ class SubApertureNode(CsasNode):
             self.log_throttled(note, note, "warn")
 
     def on_source(self, beat: Heartbeat) -> None:
-        """Close the run once the source of the sectors says that they are all here."""
+        """Close the run once the source of the sectors says that all have arrived."""
         if not self.runs or beat.values.get("stream") != "sector":
             return
         run = self.runs[-1]
@@ -318,7 +318,7 @@ class SubApertureNode(CsasNode):
     # One run after another
 
     def advance(self) -> None:
-        """Offer the views that can be made by now; begin again where the target or the views have changed."""
+        """Offer the views that can be made; begin again if the target or the views have changed."""
         run, flow = self.run, self.source.flow
         if run is None:
             return
@@ -350,7 +350,7 @@ class SubApertureNode(CsasNode):
         self.go_on(run)
 
     def decides(self, run: Run) -> bool:
-        """Say whether it is time to decide on the whole run's target, once all sectors are here.
+        """Say whether to decide on the whole run's target now that all sectors have arrived.
 
         The search takes a second. Views that are due already, and whoever looks at the grid, need not wait
         for it, unless they wait for something else themselves.
@@ -365,13 +365,13 @@ class SubApertureNode(CsasNode):
         return not self.source.flow.pending or time.monotonic() - run.ended_s > _DECIDE_S
 
     def look_again(self) -> None:
-        """Go on with what waits until views that are on their way have left the graph."""
+        """Resume work that waits until views in flight have left the graph."""
         if (self.run is not None and self.run.ended_s is not None) or len(self.runs) > 1:
             self.advancing.trigger()
         self.begin_again()
 
     def tick(self) -> None:
-        """Refuse by name what has waited too long for its track."""
+        """Refuse messages that have waited too long for their track, by name."""
         held, self.unplaced = self.unplaced, []
         for since_s, image, info in held:
             if time.monotonic() - since_s > HOLD_S:
@@ -380,7 +380,7 @@ class SubApertureNode(CsasNode):
                 self.unplaced.append((since_s, image, info))
 
     def begin_again(self) -> None:
-        """Publish another target, and offer its views, once those of the one before have left the graph."""
+        """Publish another target and offer its views, once the previous views have left the graph."""
         run, flow = self.run, self.source.flow
         if run is None or not flow.held or flow.in_flight:
             return
@@ -411,7 +411,7 @@ class SubApertureNode(CsasNode):
         flow.more_to_come = not stream.final
 
     def go_on(self, run: Run) -> None:
-        """Begin the next run once this one's views have left the graph, or it cannot be processed."""
+        """Begin the next run once this one's views have left the graph, or this one has failed."""
         flow, stream = self.source.flow, run.stream
         if len(self.runs) < 2:
             return
@@ -431,7 +431,7 @@ class SubApertureNode(CsasNode):
         self.advancing.trigger()
 
     def judge(self, run: Run) -> bool:
-        """Say whether image and track may belong together, as far as that is known; raise if they cannot."""
+        """Check that image and track may belong together, as far as known; raise if they cannot."""
         stream = run.stream
         if stream.track is None or not stream.sum.stamps or stream.final:
             return True
@@ -459,14 +459,14 @@ class SubApertureNode(CsasNode):
         return True
 
     def fail(self, run: Run, error: CsasError) -> None:
-        """Say that the run cannot be processed at all: once, and in every heartbeat."""
+        """Announce that the run cannot be processed: once in the log, and in every heartbeat."""
         run.failed, run.image = f"{type(error).__name__}: {error}", None
         self.error = run.failed
         self.get_logger().error(self.error)
         self.go_on(run)
 
     def publish_decision(self, decision: Decision, run: Run, *, may_move: bool) -> None:
-        """Publish what is carved, and the target's volume for whoever knows that topic alone."""
+        """Publish the decision, and the target's volume on its own topic."""
         stamp, frame = run.target_sent, run.stream.sum.frame.frame
         decision = replace(decision, frame=frame)
         # First, so that whoever takes the target knows what else there is.

@@ -63,7 +63,7 @@ _RATE_S = 5.0
 
 
 class CatchingUp(Inlet):
-    """The reports of a stream's views that are in the store: a sink for as long as some are lacking."""
+    """The reports on a stream's stored views: a sink while some are missing."""
 
     def __init__(self, node: ViewerNode, stream: str) -> None:
         # No subscriptions of its own: the viewer's are there anyway.
@@ -75,11 +75,11 @@ class CatchingUp(Inlet):
         self.instance = f"{node.instance}-{stream}"
 
     def give_up_lonely(self) -> None:
-        """Nothing is kept that could be lonely."""
+        """Do nothing: no unpaired messages are kept here."""
 
 
 class ViewerNode(CsasNode):
-    """Takes everything that can be seen; serves the page."""
+    """Takes everything that can be shown; serves the page."""
 
     name = "viewer"
     server: ViewerServer | None = None
@@ -143,7 +143,7 @@ class ViewerNode(CsasNode):
         self.forget()
 
     def state_counts(self) -> dict[str, int]:
-        """Return how many views of each stream can be seen."""
+        """Return the number of stored views per stream."""
         if self.server is None:
             return {}
         return {name: len(self.store.sets[name]) for name in VIEW_STREAMS}
@@ -294,7 +294,7 @@ class ViewerNode(CsasNode):
     # Catching up, once nobody else needs the source
 
     def on_source(self, beat: Heartbeat) -> None:
-        """Join when a source has finished and views are lacking; leave when they are here."""
+        """Join when a source has finished and views are missing; leave when they have arrived."""
         own = beat.values.get("stream", "")
         if own == "sector" or self.server is None:
             self._heard_s = time.monotonic()
@@ -349,7 +349,7 @@ class ViewerNode(CsasNode):
         self._finished = True
 
     def tick(self) -> None:
-        """Say on the page how the run goes."""
+        """Show the run's progress on the page."""
         now = time.monotonic()
         if now - self._said_s > 1.0 and self.server is not None:
             self._said_s = now

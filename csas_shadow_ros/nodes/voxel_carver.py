@@ -1,4 +1,4 @@
-"""Node `voxel_carver`: carves the voxel grid, measures what it leaves, and publishes it (section 4)."""
+"""Node `voxel_carver`: carves the voxel grid, measures and publishes it (section 4)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _PARTS = {"shadow_mask": ("mask",), "likelihood": ("likelihood",), "shadow": ("l
 
 
 class VoxelCarverNode(CsasNode):
-    """Takes `shadow_mask/*` (soft: `likelihood/*`) and `shadow/*`; publishes all that there is to say.
+    """Takes `shadow_mask/*` (soft: `likelihood/*`) and `shadow/*`; publishes the whole result.
 
     It carves by the one, and measures against the other: where a silhouette ends to a fraction of a pixel,
     and which hollows no shadow shows. Where nobody publishes `shadow/*`, silhouettes are all that it goes by.
@@ -96,30 +96,30 @@ class VoxelCarverNode(CsasNode):
         return Inlet(self, stream, "sink", partial(self.work, stream), hold=self.hold, optional=optional)
 
     def outlet(self, name: str) -> Publisher:
-        """Return the publisher of a topic of the result; a further object's is made when it is needed."""
+        """Return the publisher of a topic of the result, made on demand for a further object."""
         if name not in self.outlets:
             self.outlets[name] = self.publisher(name, qos.LATCHED)
         return self.outlets[name]
 
     def open_outlets(self, prefix: str) -> None:
-        """Make the publishers of another grid early: who records has to find them before they are used."""
+        """Make the publishers of another grid early, so that recorders find them in time."""
         for name in PREFIXED_TOPICS:
             self.outlet(prefixed(prefix, name))
 
     # Which target, and which run
 
     def hold(self, stamp: int) -> tuple[str, float]:
-        """Let views wait until it is known what is carved, and which run they are of."""
+        """Let views wait until their run and target are known."""
         reason = self.target.missing()
         return (reason, math.inf) if reason else self.runs.hold(stamp)
 
     def release(self) -> None:
-        """Work on views that have waited."""
+        """Process views that have waited."""
         for inlet in list(self.inlets):
             inlet.release()
 
     def on_target(self) -> None:
-        """Take views for the further bodies, if there are any."""
+        """Subscribe to views for further bodies, if there are any."""
         wanted = bool(self.target.decision.others)
         for number in range(2, len(self.target.decision.others) + 2):
             self.open_outlets(object_prefix(number))
@@ -135,12 +135,12 @@ class VoxelCarverNode(CsasNode):
         self.release()
 
     def on_place(self) -> None:
-        """Publish the result again if it may be elsewhere."""
+        """Publish the result again if its place may have changed."""
         if self.result is not None:
             self.growing.changed()
 
     def begin_again(self, *, another_run: bool) -> None:
-        """Drop what was made of a target that has moved; of a run that is over, publish the end first."""
+        """Drop the state of a moved target; for a finished run, publish the final result first."""
         if another_run and self.reconstruction is not None and not self.growing.complete:
             self.growing.finish()
         # What was published stays until there is something new to say.
@@ -148,7 +148,7 @@ class VoxelCarverNode(CsasNode):
         self.growing.begin_again()
 
     def of_run(self, stamp: int) -> Reconstruction:
-        """Return what a view of a stamp goes into."""
+        """Return the reconstruction for a view's stamp."""
         run_ns = self.runs.run_of(stamp)
         given = self.parameters.target == "given"
         mine = self.reconstruction.run_ns if self.reconstruction is not None else self.target.run_ns
@@ -179,14 +179,14 @@ class VoxelCarverNode(CsasNode):
         return f"the source of views has been silent for {silent_s:.0f} s" if silent_s else ""
 
     def state_counts(self) -> dict[str, int]:
-        """Return how many views the grid holds, and whether that is all."""
+        """Return the number of views in the grid, and whether they are complete."""
         made = self.reconstruction
         complete = hasattr(self, "growing") and self.growing.complete
         arc = round(math.degrees(made.arcs.covered_rad)) if made is not None else 0
         return {"views": len(made.stamps) if made else 0, "complete": int(complete), "arc_deg": arc}
 
     def state_values(self) -> dict[str, str]:
-        """Return the run's name, and how large the object is as far as it has been seen."""
+        """Return the run's name and the object's size so far."""
         made, result = self.reconstruction, self.result
         values = {} if made is None or made.run_ns is None else {"run": str(made.run_ns)}
         if result is None:
@@ -201,7 +201,7 @@ class VoxelCarverNode(CsasNode):
     # Views
 
     def work(self, stream: str, image: Any, info: Any) -> str | None:
-        """Take one stage of a view in; what is in already changes nothing."""
+        """Add one stage of a view; a repeated one changes nothing."""
         view = view_from_msgs(image, info, stream)
         target = self.target.target
         if target is None:
@@ -220,7 +220,7 @@ class VoxelCarverNode(CsasNode):
         return False
 
     def on_source(self, beat: Heartbeat) -> None:
-        """Finish once a source says that every view is here."""
+        """Finish once a source says that every view has arrived."""
         own = beat.values.get("target", self.target.stamp) == self.target.stamp
         if beat.values.get("stream") != "sector" and own:
             self.growing.source_says(self.inlet.instance in beat.values.get("finished_for", "").split())
@@ -230,7 +230,7 @@ class VoxelCarverNode(CsasNode):
     # Results
 
     def show(self) -> None:
-        """Publish what has changed."""
+        """Publish the changes."""
         if not self.active or self.rival:
             return
         made = self.reconstruction
@@ -245,7 +245,7 @@ class VoxelCarverNode(CsasNode):
             self.log_end()
 
     def log_end(self) -> None:
-        """Say what the run has left."""
+        """Log the run's result."""
         result = self.result
         if result is None:
             self.get_logger().info("complete: no view came, so no object is known")
@@ -264,11 +264,11 @@ class VoxelCarverNode(CsasNode):
             )
 
     def wanted(self) -> bool:
-        """Say whether anybody looks at unfinished results."""
+        """Say whether anybody subscribes to unfinished results."""
         return any(publisher.get_subscription_count() for publisher in self.outlets.values())
 
     def publish_result(self) -> None:
-        """Publish everything as it is; large messages of an unfinished result to those who look alone."""
+        """Publish the present result; large messages of an unfinished one only if subscribed."""
         final = self.growing.final
         made = self.reconstruction
         if made is None:  # nothing came: no object as far as anybody knows

@@ -22,7 +22,7 @@ class Arc:
     width_rad: float
 
     def widened(self, by_rad: float) -> Arc:
-        """Return the arc with so much more at both ends."""
+        """Return the arc extended by this angle at both ends."""
         return Arc(self.start_rad - by_rad, self.width_rad + 2.0 * by_rad)
 
     def touches(self, other: Arc) -> bool:
@@ -63,7 +63,7 @@ class Arcs:
 
     @property
     def covered_rad(self) -> float:
-        """How much of the circle they cover."""
+        """Covered part of the circle (rad)."""
         return sum(high - low for low, high in self._pieces)
 
     @property
@@ -83,7 +83,7 @@ class Arcs:
         )
 
     def contains(self, aspects_rad: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Say of each aspect whether it is covered."""
+        """Say for each aspect whether it is covered."""
         a = np.mod(aspects_rad, TWO_PI)
         inside = np.zeros(a.shape, bool)
         for low, high in self._pieces:

@@ -229,7 +229,7 @@ class ShadowCamera:
 def view_ground_to_pixel(
     aspect_rad: float, spacing_m: float, rows: int, cols: int, centre_m: tuple[float, float]
 ) -> FloatArray:
-    """Return A (3×3) of a view of aspect θ whose middle pixel looks at `centre_m` (x, y)."""
+    """Return A (3×3) of a view of aspect θ with its middle pixel at `centre_m` (x, y)."""
     e_c, e_r = cross_range_axis(aspect_rad), down_range_axis(aspect_rad)
     linear = np.vstack([e_c, e_r]) / spacing_m
     middle = np.array([(cols - 1) / 2.0, (rows - 1) / 2.0])

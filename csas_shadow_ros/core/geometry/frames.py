@@ -18,7 +18,7 @@ TWO_PI = 2.0 * math.pi
 
 
 def one_frame(what: str, frame: str, expected: str, of: str) -> None:
-    """Refuse something of a run that is in another frame than the rest.
+    """Refuse an item of a run in another frame than the rest.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class GroundGrid:
     def centred(
         cls, rows: int, cols: int, spacing_m: float, centre_m: tuple[float, float] = (0.0, 0.0)
     ) -> GroundGrid:
-        """Make a grid whose middle lies at `centre_m` (x, y)."""
+        """Make a grid with its middle at `centre_m` (x, y)."""
         x_min = centre_m[0] - (cols - 1) / 2.0 * spacing_m
         y_max = centre_m[1] + (rows - 1) / 2.0 * spacing_m
         return cls(rows, cols, spacing_m, x_min, y_max)

@@ -97,7 +97,7 @@ class GroundLattice:
 
     @property
     def extent_m(self) -> tuple[float, float, float, float]:
-        """(left, right, bottom, top) of what it covers whole.
+        """(left, right, bottom, top) of the wholly covered ground.
 
         The outer edges where it is north-up; else the largest upright square about its middle.
         """
@@ -114,7 +114,7 @@ class GroundLattice:
 
 
 def ground_from_projection(projection: ArrayLike, rows: int, cols: int) -> GroundGrid | GroundLattice:
-    """Read a ground-plane image's lattice from its orthographic P: a grid where it is north-up and square.
+    """Read a ground-plane image's lattice from its orthographic P: a grid if it is north-up and square.
 
     Raises
     ------

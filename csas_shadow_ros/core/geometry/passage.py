@@ -113,7 +113,7 @@ class _Circle:
 def passage(
     track: Track, *, image_ns: int | None = None, sectors: Sequence[tuple[int, float, float]] = ()
 ) -> Passage:
-    """Select the poses of a track that count: those on the circle, of the lap that a stamp names.
+    """Select the poses of a track that count: those on the circle, in the lap that a stamp names.
 
     Parameters
     ----------

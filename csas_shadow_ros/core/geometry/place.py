@@ -30,7 +30,7 @@ _SIGMAS_95 = 1.959964
 
 @dataclass(frozen=True)
 class Place:
-    """Where an object is on earth.
+    """The place of an object on earth.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ class Datum:
         return (90.0 - math.degrees(heading_rad) + self.heading_deg) % 360.0
 
     def place_of(self, dimensions: Dimensions) -> Place:
-        """Return where on earth an object is."""
+        """Return an object's place on earth."""
         d = dimensions
         latitude, longitude = self.to_latlon(*d.position_m)
         bearing = self.bearing_deg(d.heading_rad) % 180.0
@@ -203,7 +203,7 @@ class Datum:
 
 @dataclass(frozen=True)
 class Origin:
-    """A datum as somebody has said it.
+    """A datum as somebody stated it.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ class Origin:
 
 
 def origin_of(origins: Iterable[Origin], frame: str, last_ns: int | None = None) -> Origin | None:
-    """Choose the origin that counts for a run: the newest of its frame that was there before its end.
+    """Choose the origin that counts for a run: the newest in its frame before its end.
 
     Parameters
     ----------

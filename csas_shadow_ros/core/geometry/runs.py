@@ -26,7 +26,7 @@ _SEAM_STEPS = 10.0
 
 @dataclass(frozen=True, eq=False)
 class TrackPiece:
-    """Poses as one message brings them: a whole track, a longer version of it, or a part.
+    """Poses of one message: a whole track, a longer version of it, or a part.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ class _Run:
 
 
 class TrackBook:
-    """The runs of which poses are known, from pieces of tracks in any order.
+    """The runs with known poses, from pieces of tracks in any order.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ class TrackBook:
         return len(self._runs)
 
     def add(self, piece: TrackPiece) -> int:
-        """Take a piece and return the name of the run that it belongs to.
+        """Add a piece and return the name of its run.
 
         A run that is called otherwise now, as an earlier pose came or two runs became one, is in `renamed`.
 
@@ -232,7 +232,7 @@ class TrackBook:
         return run.first
 
     def run_of(self, stamp_ns: int) -> int | None:
-        """Return the name of the run whose track covers a stamp; None if there is none.
+        """Return the name of the run with a track over this stamp; None if there is none.
 
         A run covers as much time before its first and after its last pose as the sonar takes for
         `max_gap_rad`: views between the last pose of a closed circle and its first are stamped there. Of
@@ -242,7 +242,7 @@ class TrackBook:
         return runs[0] if runs else None
 
     def runs_of(self, stamp_ns: int) -> tuple[int, ...]:
-        """Return the names of all runs whose tracks cover a stamp, `run_of` first."""
+        """Return the names of all runs with tracks over this stamp, `run_of` first."""
         found = []
         for age, run in enumerate(reversed(self._runs)):
             beyond = max(run.first - stamp_ns, stamp_ns - run.last, 0)
@@ -256,7 +256,7 @@ class TrackBook:
         return run.first, run.last
 
     def track(self, run_ns: int) -> Track:
-        """Return all poses of a run; the very same object until another piece of it comes.
+        """Return all poses of a run; the same object until another piece arrives.
 
         Raises
         ------
@@ -275,7 +275,7 @@ class TrackBook:
         return self._run(run_ns).frame
 
     def notes(self, run_ns: int) -> tuple[str, ...]:
-        """Return what the pieces of a run said of poses that were left out."""
+        """Return the pieces' notes on poses that were left out."""
         return tuple(self._run(run_ns).notes)
 
     def _run(self, run_ns: int) -> _Run:

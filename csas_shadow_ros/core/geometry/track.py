@@ -29,7 +29,7 @@ class AspectGap:
 
 @dataclass(frozen=True)
 class DoubtfulArc(AspectGap):
-    """An arc that the track passes more than once, from places that are not the same.
+    """An arc that the track passes more than once, at different places.
 
     Parameters
     ----------

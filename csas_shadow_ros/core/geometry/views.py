@@ -18,7 +18,7 @@ from .frames import TWO_PI, Acoustics, FloatArray, GroundGrid, down_range_axis
 
 @dataclass(frozen=True)
 class ViewInfo:
-    """Everything about a view except its pixels: what its ``CameraInfo`` carries.
+    """Everything about a view except its pixels: the content of its ``CameraInfo``.
 
     Parameters
     ----------
@@ -147,13 +147,13 @@ class CoherentImage:
 
 
 def looks_at(info: ViewInfo, target_m: tuple[float, float]) -> bool:
-    """Say whether a view's focus range is that of a target, r₀ = e_r · target; without one it may be."""
+    """Say whether a view may be focused on a target, r₀ = e_r · target; without a focus range it may."""
     r0 = float(down_range_axis(info.aspect_rad) @ np.asarray(target_m, dtype=np.float64))
     return not math.isfinite(info.focus_range_m) or abs(info.focus_range_m - r0) < 1e-6
 
 
 def fit_target_to_focus(infos: Sequence[ViewInfo]) -> tuple[float, float]:
-    """Find the ground point whose down-range in every view is that view's focus range.
+    """Find the ground point at the focus range of every view.
 
     r₀(θ) = e_r(θ) · target is one line a view; two aspects or more give the point (least squares).
 

@@ -82,7 +82,7 @@ class Composites:
 
     @classmethod
     def for_view(cls, view: View) -> Composites:
-        """Make the accumulator whose grid covers what views like this one cover."""
+        """Make an accumulator with a grid that covers the ground of views like this one."""
         camera = view.info.camera
         spacing = float(np.mean(camera.spacing_m))
         middle = camera.pixel_to_ground[:2] @ np.array(
@@ -119,7 +119,7 @@ class Composites:
         return True
 
     def multilook(self) -> NDArray[np.float32]:
-        """Return the multi-look amplitude: root of the mean power over the views; NaN where none looked."""
+        """Return the multi-look amplitude, the root of the mean power over the views; NaN where unseen."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self._count > 0, np.sqrt(self._power / self._count), np.float32(np.nan))
 

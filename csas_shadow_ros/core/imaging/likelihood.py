@@ -70,13 +70,13 @@ class Levels:
         return self.local.known
 
     def echoes(self, echo_db: float) -> NDArray[np.bool_]:
-        """Return `echo_mask` of the view, worked out once: likelihood and segmentation both ask for it."""
+        """Return `echo_mask` of the view, computed once for likelihood and segmentation."""
         if echo_db not in self._echoes:
             self._echoes[echo_db] = echo_mask(self.local, echo_db)
         return self._echoes[echo_db]
 
     def unknown_echoes(self, parameters: LikelihoodParameters) -> NDArray[np.bool_]:
-        """Return the echoes that know nothing: all or none, as the parameters say."""
+        """Return the echoes that count as unknown: all or none, by the parameters."""
         return self.echoes(parameters.echo_db) if parameters.echo_unknown else np.zeros_like(self.known)
 
 

@@ -39,7 +39,7 @@ _index = np.uintp
 
 @kernel()
 def known_span(known: BoolImage, v: int) -> tuple[int, int]:  # pragma: no cover
-    """Return the columns between which a row knows anything: first, and one after the last."""
+    """Return the span of a row's known columns: the first, and one after the last."""
     cols = known.shape[1]
     first, last = 0, cols
     while first + _CHUNK <= cols and not _any(known, v, first):
@@ -330,7 +330,7 @@ class LocalMeans:
         return max(rows, 1), max(cols, 1)
 
     def pixels(self, cells: float) -> int:
-        """Return how many pixels so many resolution cells have."""
+        """Return the number of pixels in this many resolution cells."""
         return math.ceil(cells * self.cell_px[0] * self.cell_px[1])
 
     def under(

@@ -22,7 +22,7 @@ _FLANK_CELLS = 1.2
 
 
 def beside_px(info: ViewInfo) -> int:
-    """Return how many columns on either side an echo speaks for."""
+    """Return how many columns on either side an echo covers."""
     return max(1, round(_BESIDE_CELLS * info.cell_px[1]))
 
 
@@ -62,7 +62,7 @@ class KeptMask:
 
 
 def near_covered(mask: View) -> View:
-    """Take covered pixels that lie farther before a stretch of shadow than it is long for lit seabed.
+    """Mark covered pixels as lit seabed if they lie farther before a stretch of shadow than it is long.
 
     What stands that near may be an open frame, what lies farther a low wide body: the two readings of a mask
     between which carving decides (`Carver`).

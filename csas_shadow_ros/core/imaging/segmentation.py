@@ -1,4 +1,4 @@
-"""Segment the target's shadow in a view, which the paper did by hand (section 4.1, figure 7).
+"""Segment the target's shadow in a view; the paper does this by hand (section 4.1, figure 7).
 
 The silhouette that hard carving needs is everything that the target hides: its shadow, and its own
 echo laid over the near end of it. The shadow is found by contrast; echo is marked as "knows nothing", and
@@ -336,7 +336,7 @@ def silhouette_found(mask: View) -> bool:
 
 
 def require_silhouette(mask: View) -> View:
-    """Return the mask, or refuse a view in which no shadow of the target was found.
+    """Return the mask, or refuse a view without a shadow of the target.
 
     Raises
     ------

@@ -68,7 +68,7 @@ class Spectrum:
 
     @classmethod
     def of_image(cls, image: CoherentImage, workers: int = 2) -> Spectrum:
-        """Transform an image, zero-padded to a size that transforms fast.
+        """Transform an image, zero-padded to a fast size.
 
         Parameters
         ----------
@@ -421,7 +421,7 @@ class SubApertures:
         return len(self.aspects_rad)
 
     def info(self, aspect_rad: float) -> ViewInfo:
-        """Return what is known of the view of an aspect before it is made.
+        """Return the geometry and band of the view of an aspect before it is made.
 
         Raises
         ------
@@ -454,7 +454,7 @@ class SubApertures:
         return round(-k * math.sin(aspect_rad) / steps[0]), round(k * math.cos(aspect_rad) / steps[1])
 
     def wedge_edges(self, aspect_rad: float) -> tuple[float, float]:
-        """Return the angles in the spectrum between which the view's energy lies.
+        """Return the angles in the spectrum that bound the view's energy.
 
         They are rounded to 1e-9 rad so that neighbours of a partition name the same edge alike.
         """

@@ -1,4 +1,4 @@
-"""Where is the target, how large a volume must be carved, and does the spectrum's sign fit it?
+"""Find the target and the volume to carve, and check the spectrum's sign.
 
 All three are asked of the shadows: a coarse soft carving of the whole scene with narrow sub-apertures,
 which need no focus. Whatever casts a shadow of its own from all sides stands out as a body. What is then
@@ -105,7 +105,7 @@ HOLLOW = (
 
 
 def stands_on_seabed(bottom_m: float, top_m: float) -> bool:
-    """Say whether a body that reaches from one height to another rests on the seabed.
+    """Say whether a body between these heights rests on the seabed.
 
     The shadows of several bodies cross, and high over the seabed between them a voxel's shadow may fall into
     one of these from nearly every side. Such a phantom has nothing under it. A body's lowest voxels may be
@@ -138,13 +138,13 @@ class Thrown:
 
     @property
     def contrast_db(self) -> float:
-        """How far the core lies under the seabed."""
+        """Contrast of the core below the seabed."""
         return -10.0 * math.log10(max(self.core, 1e-3))
 
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What the search found and what it left out, and the coarse grid that it looked at."""
+    """Bodies that the search found and left out, and its coarse grid."""
 
     targets: tuple[Target, ...]
     volume: Volume
@@ -155,12 +155,12 @@ class Search:
 
     @property
     def best(self) -> Target | None:
-        """The most evident body, or None."""
+        """The body with the most evidence, or None."""
         return self.targets[0] if self.targets else None
 
 
 def search_views(views: Sequence[View]) -> Search:
-    """Look for bodies in a few views from all round.
+    """Search a few views from all round for bodies.
 
     Parameters
     ----------
@@ -558,7 +558,7 @@ def _views_of_search(sub_apertures: SubApertures, workers: int = 2) -> list[View
 
 
 def search_image(image: CoherentImage, track: Track, spectrum: Spectrum) -> Search | None:
-    """Look for bodies in a coherent image; None where the track leaves no view to look in."""
+    """Search a coherent image for bodies; None if the track leaves no view."""
     views = _views_of_search(_searching(image, track, spectrum))
     return search_views(views) if views else None
 
@@ -581,7 +581,7 @@ class SignEvidence:
 
     @property
     def verdict(self) -> str:
-        """'right', 'wrong', or 'unknown' where there are no shadows to tell it by."""
+        """'right', 'wrong', or 'unknown' without shadows that decide."""
         if self.stated_evidence > _SIGN_RATIO * self.other_evidence:
             return "right"
         if self.other_evidence > _SIGN_RATIO * self.stated_evidence:

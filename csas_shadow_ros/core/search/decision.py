@@ -1,4 +1,4 @@
-"""What is to be carved: the one decision that every run takes, whatever it has to look at."""
+"""What to carve: the one decision of every run, whatever its input."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PHANTOM = "a phantom: shadows of other bodies cross over it, and it does not rea
 
 @dataclass(frozen=True)
 class Decision:
-    """What is to be carved in a scene.
+    """What to carve in a scene.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class Decision:
             )
 
     def same_target(self, other: Decision) -> bool:
-        """Say whether views made for one decision serve the other: the same volumes are carved."""
+        """Say whether views for one decision serve the other, with the same volumes."""
         return [_place(t) for t in (self.target, *self.others)] == [
             _place(t) for t in (other.target, *other.others)
         ]
@@ -80,7 +80,7 @@ def decide(
     max_objects: int = MAX_OBJECTS,
     beyond: str = "no more than {max_objects} bodies are carved",
 ) -> Decision:
-    """Choose among what a search found.
+    """Choose among the bodies that a search found.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def decide_by_image(
     spectrum: Spectrum,
     max_objects: int = MAX_OBJECTS,
 ) -> Decision:
-    """Decide by the full-circle image, or by as much of it as the track covers.
+    """Decide by the full-circle image, or by the part that the track covers.
 
     `parameters.sub_aperture.check_sign` says whether the spectrum's sign is checked. Errors: see `decide`.
     """

@@ -28,7 +28,7 @@ _MARGIN_VOXELS = 3
 
 
 def connected_pieces(occupied: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
-    """Return the pieces of a carved grid that do not touch one another, the largest first.
+    """Return the separate pieces of a carved grid, the largest first.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def connected_pieces(occupied: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
 
 
 def overlap_share(a: VoxelGrid, b: VoxelGrid) -> float:
-    """Return how much two grids' objects share, as a fraction of the smaller one (by volume).
+    """Return the overlap of two grids' objects, as a fraction of the smaller one (by volume).
 
     The lattices may differ: a voxel of `a` is shared where its centre lies in an occupied voxel of `b`.
     """
@@ -72,7 +72,7 @@ def overlap_share(a: VoxelGrid, b: VoxelGrid) -> float:
 def objects_of(
     grid: VoxelGrid, place_m: tuple[float, float], reported: Sequence[VoxelGrid]
 ) -> tuple[list[VoxelGrid], list[LeftOut]]:
-    """Tell the objects in a body's carved volume, without what was reported before.
+    """List the objects in a body's carved volume that were not reported before.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ _FOLD_SLACK = 0.05
 
 
 class HasBand(Protocol):
-    """A sector, or what is known of one before its pixels are read."""
+    """A sector, or its description before its pixels are read."""
 
     @property
     def grid(self) -> GroundGrid | GroundLattice:
@@ -125,7 +125,7 @@ def same_grid(a: GroundGrid, b: GroundGrid) -> bool:
 
 
 def same_band(a: Acoustics, b: Acoustics) -> bool:
-    """Say whether two bands are the same, to a millionth: programs work them out anew for each sector."""
+    """Say whether two bands are the same, to a millionth, as programs recompute them for each sector."""
     return a.spectrum_sign == b.spectrum_sign and all(
         math.isclose(x, y, rel_tol=1e-6)
         for x, y in (
@@ -137,7 +137,7 @@ def same_band(a: Acoustics, b: Acoustics) -> bool:
 
 
 def unlike(own: HasBand, expected: HasBand) -> tuple[str, str] | None:
-    """Say whether a sector's ``frame`` or ``band`` is another, with both values; None if neither is."""
+    """Return how a sector's ``frame`` or ``band`` differs, with both values; None if both agree."""
     if own.frame != expected.frame:
         return "frame", f"{own.frame!r}; expected {expected.frame!r}"
     if not same_band(own.acoustics, expected.acoustics):
@@ -226,7 +226,7 @@ def _ground(extent_m: tuple[float, float, float, float]) -> str:
 
 
 def scene_of(first: HasBand) -> GroundGrid:
-    """Return the lattice of the image that a run's sectors add up to, by the first of them.
+    """Return the lattice of the image that a run's sectors sum to, from the first sector.
 
     Its own lattice where that holds the whole circle's band. Otherwise one over the same ground that holds
     the band at any grazing angle (a pixel of c / 4 (f_c + B/2)), of a size that transforms fast: so it is the

@@ -1,4 +1,4 @@
-"""Views while the vehicle still circles: sectors are summed as they come, a view is made once it is whole.
+"""Views while the vehicle still circles: sums sectors as they arrive, makes a view once it is complete.
 
 A sector is one arc of the full-circle image, so its spectrum is one arc of the image's spectrum. `SectorSum`
 adds that arc alone, so a view needs no more than the sectors that overlap its aperture, and what it is
@@ -100,7 +100,7 @@ def _on_scene(
 
 
 def uncovered(arcs: Arcs, track: Track) -> list[Arc]:
-    """Return the arcs that a track goes through, but no sector covers."""
+    """Return the arcs of a track that no sector covers."""
     return [
         arc
         for arc in arcs.missing()
@@ -109,7 +109,7 @@ def uncovered(arcs: Arcs, track: Track) -> list[Arc]:
 
 
 class SectorSum:
-    """The full-circle spectrum, summed from sectors in any order as they come.
+    """The full-circle spectrum, summed from sectors in any order.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ class SectorSum:
 
     @property
     def spectrum(self) -> Spectrum:
-        """What has been summed so far.
+        """The sum so far.
 
         Raises
         ------
@@ -172,7 +172,7 @@ class SectorSum:
 
     @property
     def frame(self) -> CoherentImage:
-        """The image's lattice and band, with pixels that take no memory and hold nothing."""
+        """The image's lattice and band, with empty pixels that take no memory."""
         first, scene = self._first, self._scene
         if first is None or scene is None:
             raise GeometryError("there are no sectors to sum; expected at least one")
@@ -322,7 +322,7 @@ class SectorSum:
 
 
 def part_of_track(track: Track, arcs: Arcs) -> Track | None:
-    """Return the poses whose aspects the arcs cover; None if they make no track."""
+    """Return the poses at aspects within the arcs; None if they make no track."""
     inside = arcs.contains(track.aspects_rad)
     if int(inside.sum()) < 3:
         return None
@@ -340,7 +340,7 @@ def same_track(a: Track, b: Track) -> bool:
 
 
 class Stream:
-    """What can be made of a run that is still going on.
+    """The views and decisions of a run that is still going on.
 
     Parameters
     ----------
@@ -396,16 +396,16 @@ class Stream:
 
     @property
     def target_known(self) -> bool:
-        """Whether it has been decided on, for the time being or for good, what is carved."""
+        """Whether the target is decided, provisionally or finally."""
         return self.decision is not None
 
     @property
     def target(self) -> Target | None:
-        """What the run is about; None where that is not known, or nothing is there."""
+        """The run's target; None if unknown or absent."""
         return None if self.decision is None else self.decision.target
 
     def take_track(self, track: Track) -> bool:
-        """Take all poses of the run that are known by now; False if nothing changes by them."""
+        """Take all known poses of the run; False if they change nothing."""
         if self._poses is not None and len(track) < len(self._poses):
             return False
         self._poses = track
@@ -424,7 +424,7 @@ class Stream:
         return True
 
     def add(self, sector: Sector) -> bool:
-        """Add a sector; False if it is in already.
+        """Add a sector; False if it is already in.
 
         Raises
         ------
@@ -468,12 +468,12 @@ class Stream:
         self._choose_passage()
 
     def finish(self) -> None:
-        """Say that no more sectors are to come; those that come nevertheless are late."""
+        """State that no more sectors will come; any further ones are late."""
         self._all_here = True
 
     @property
     def ended(self) -> bool:
-        """Whether all sectors are here: the circle is closed, or their source said so."""
+        """Whether all sectors have arrived: the circle is closed, or their source said so."""
         return self._all_here or self.sum.arcs.whole
 
     def missing(self) -> list[Arc]:
@@ -481,7 +481,7 @@ class Stream:
         return [] if self.track is None else uncovered(self.sum.arcs, self.track)
 
     def update(self, *, decide: bool = True) -> list[int]:
-        """Decide on the target as far as it can be, and return the stamps of the views that became due.
+        """Decide on the target as far as possible, and return the stamps of newly due views.
 
         Parameters
         ----------
@@ -576,7 +576,7 @@ class Stream:
 
 
 class StreamedRun:
-    """The whole method on a run that is still going on: sectors in, a grid that grows.
+    """The whole method on a run that is still going on: sectors in, a growing grid out.
 
     Parameters
     ----------
@@ -615,19 +615,19 @@ class StreamedRun:
         self._revision = 0
 
     def take_track(self, track: Track) -> list[ProcessedView]:
-        """Take the track, or a longer one; return the views that became due."""
+        """Take the track, or a longer one; return the newly due views."""
         self.stream.take_track(track)
         if self.run_ns is None:
             self.run_ns = int(track.stamps_ns[0])
         return self._advance()
 
     def add(self, sector: Sector) -> list[ProcessedView]:
-        """Add a sector; return the views that became due, which are in the grid then."""
+        """Add a sector; return the newly due views, which are then in the grid."""
         self.stream.add(sector)
         return self._advance()
 
     def finish(self) -> list[ProcessedView]:
-        """Say that no more sectors are to come; return the views that became due."""
+        """State that no more sectors will come; return the newly due views."""
         self.stream.finish()
         return self._advance()
 
@@ -658,11 +658,11 @@ class StreamedRun:
         return made
 
     def grid(self) -> VoxelGrid | None:
-        """Return the grid as it is; None before the first view."""
+        """Return the present grid; None before the first view."""
         return self.result().grid
 
     def result(self, *, final: bool | None = None) -> Result:
-        """Say what there is by now; by default in full once the run is over."""
+        """Return the result so far; by default in full once the run is over."""
         from ..shape.result import Result
 
         if self.reconstruction is None:

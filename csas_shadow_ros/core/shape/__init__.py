@@ -1,1 +1,1 @@
-"""The shape: what the carved voxels, their echoes and the shadows' edges say of it, and how sure that is."""
+"""The shape, from carved voxels, their echoes and the shadows' edges, and its uncertainty."""

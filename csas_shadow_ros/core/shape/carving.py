@@ -371,7 +371,7 @@ def _part_of_image(
 
 
 class Carver:
-    """A voxel grid that views are integrated into, one by one and in any order.
+    """A voxel grid that integrates views one by one, in any order.
 
     Parameters
     ----------
@@ -463,7 +463,7 @@ class Carver:
         return _mean(self._sums.total, self._sums.count, self.parameters, len(self.stamps))
 
     def hopeless(self, most_views: int) -> bool:
-        """Say whether no object can be left any more, even if no further view contradicts a voxel.
+        """Say whether no object can remain, even if no further view contradicts a voxel.
 
         Parameters
         ----------
@@ -478,7 +478,7 @@ class Carver:
         return int(np.count_nonzero(self._sums.total < limit)) < LEAST_VOXELS
 
     def grid(self) -> VoxelGrid:
-        """Threshold what has been carved so far.
+        """Threshold the voxels carved so far.
 
         Returns
         -------
@@ -557,7 +557,7 @@ class Carver:
         return thresholded(self.volume, likelihood, fuller.views, self.parameters)
 
     def shadow_fits(self, grids: Sequence[VoxelGrid]) -> dict[int, ShadowFit]:
-        """Compare the silhouettes that were carved with to bodies' shadows, the own one's first, by stamp.
+        """Compare the carving silhouettes with bodies' shadows, its own body's first, by stamp.
 
         Empty for methods that keep no silhouettes (soft, hard).
         """
@@ -573,11 +573,11 @@ class Carver:
         return {stamp: one for (stamp, _), one in found}
 
     def first_look(self) -> VoxelGrid:
-        """Threshold what has been carved so far, covered pixels unknown: what `grid` starts from."""
+        """Threshold the voxels carved so far, with covered pixels unknown: the start of `grid`."""
         return thresholded(self.volume, self.likelihood(), self._sums.count, self.parameters)
 
     def beside(self, leaner: VoxelGrid, others: Sequence[VoxelGrid]) -> VoxelGrid:
-        """Add to what `grid` left what is asked for once it is known what else stands there.
+        """Add to `grid` the voxels that shadows require once the other bodies are known.
 
         Taken for unknown, pixels that other bodies' echoes may cover leave an apron between near ones. Taken
         for lit seabed they carve. What shadows ask for of the difference stays.

@@ -1,4 +1,4 @@
-"""Where the last ray over the target leaves it: the height that one picture tells by itself.
+"""The point where the last ray leaves the target: a height from a single view.
 
 The ray that grazes the target's top meets the seabed at the shadow's far end. The last echo before the shadow
 comes from where the ray left the target. Both ends of the shadow lie on that ray, so that its length in slant
@@ -58,7 +58,7 @@ _ROUND_SIGMA = 1.0 / 3.0
 
 @dataclass(frozen=True)
 class Contour:
-    """The target's last shadow in one view, column by column: what its contour is told by.
+    """The target's last shadow in one view, column by column: the source of its contour.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class Contour:
     end_m: tuple[float, ...]
 
     def points(self, info: ViewInfo) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return cross-range, down-range and height (m) of where the last rays leave the target."""
+        """Return cross-range, down-range and height (m) where the last rays leave the target."""
         sonar = info.camera.sonar_m
         origin = -float(down_range_axis(info.aspect_rad) @ sonar[:2])
         begin, end = origin + np.asarray(self.begin_m), origin + np.asarray(self.end_m)
@@ -86,7 +86,7 @@ class Contour:
 
 
 def contour_of(shadow: NDArray[np.bool_], info: ViewInfo) -> Contour | None:
-    """Find the contour that a segmented shadow tells.
+    """Find the contour that a segmented shadow implies.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def _last_stretch(shadow: NDArray[np.bool_], gap: int, out: NDArray[np.int32]) -
 
 @dataclass(frozen=True)
 class ContourHeight:
-    """What the contours of all views tell of the height.
+    """The height that the contours of all views imply.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ class ContourHeight:
 def contour_height(
     contours: Sequence[tuple[ViewInfo, Contour]], position_m: tuple[float, float], highest_m: float
 ) -> ContourHeight | None:
-    """Return the height that the views' contours tell, None where they do not agree.
+    """Return the height that the views' contours imply, None if they disagree.
 
     Parameters
     ----------

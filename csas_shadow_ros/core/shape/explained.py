@@ -1,4 +1,4 @@
-"""Which of the segmented shadow a carved body explains: its own shadow, cast back into the views.
+"""The part of the segmented shadow that a carved body explains: its own shadow, cast back into the views.
 
 A body is a set of voxels; P · X of each is the pixel that it darkens. Dark pixels of the target's silhouette
 that no voxel of it darkens are unexplained: the body lacks something, and the voxels that would supply it are
@@ -142,7 +142,7 @@ def unexplained_shadow(mask: View, grids: Sequence[VoxelGrid]) -> BoolArray:
 
 
 def shadow_fit(mask: View, grids: Sequence[VoxelGrid]) -> ShadowFit:
-    """Compare the segmented shadow with what the bodies of a scene cast.
+    """Compare the segmented shadow with the shadows that a scene's bodies cast.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def _share(part: BoolArray, whole: BoolArray) -> float:
 def count_shadow_pixels(
     mask: View, volume: Volume, voxels: NDArray[np.int32], marked: BoolArray, counts: NDArray[np.int32]
 ) -> None:
-    """Count, for each voxel, whether the pixel that its shadow falls on is marked.
+    """Count each voxel with its shadow on a marked pixel.
 
     Parameters
     ----------

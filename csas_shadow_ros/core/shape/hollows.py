@@ -63,7 +63,7 @@ _ROUNDING_PX = 2
 
 @dataclass(frozen=True, eq=False)
 class EchoLook:
-    """Where a view is dark round the target, kept small: some kB.
+    """Dark pixels of a view round the target, in some kB.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def _looks(
 
 
 def matter_of(grid: VoxelGrid, looks: Iterable[EchoLook]) -> BoolArray:
-    """Open the hollows of a carved body that shadows have filled.
+    """Open the hollows of a carved body that shadows cannot show.
 
     Parameters
     ----------

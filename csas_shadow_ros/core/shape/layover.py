@@ -33,7 +33,7 @@ def layover_per_metre(info: ViewInfo) -> NDArray[np.float64]:
 
 
 def opaque_part(occupied: BoolArray, grazing_rad: float, slack_voxels: float = 1.0) -> BoolArray:
-    """Return the voxels of a carved body that surely block the view, whatever its true top is like.
+    """Return the voxels of a carved body that block the view, whatever the shape of its true top.
 
     Shadows do not tell a flat top from one that rises towards its middle at less than the grazing angle:
     carving leaves that cap standing. A voxel under the top by less than the cap may be free in truth.

@@ -1,4 +1,4 @@
-"""How large is the object, and how sure is that?
+"""Size of the object, with intervals.
 
 Length, width, heading and position come from the sides of the silhouettes, not from the voxels. Seen from
 aspect θ, the shadow ends to either side where the target's plan does: at the plan's support h in the
@@ -152,7 +152,7 @@ class SilhouetteSides:
 
 
 def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) -> SilhouetteSides | None:
-    """Find where a view's shadow ends to both sides, to a fraction of a pixel.
+    """Find the edges of a view's shadow on both sides, to a fraction of a pixel.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
 
 
 def levels_of_mask(mask: View) -> Levels:
-    """Stand in for the levels of a view of which only the silhouette is there, such as one drawn by hand."""
+    """Substitute levels for a view with only a silhouette, such as one drawn by hand."""
     known = mask.pixels != MASK_UNKNOWN
     power = (known & (mask.pixels != MASK_SHADOW)).astype(np.float32)
     return Levels(
@@ -504,7 +504,7 @@ def _rectangle(support: FloatArray, centre: FloatArray) -> _Rectangle:
 
 @dataclass(frozen=True)
 class Cap:
-    """The top of a carved shape, of which shadows tell only so much.
+    """The top of a carved shape, which shadows show only in part.
 
     Parameters
     ----------

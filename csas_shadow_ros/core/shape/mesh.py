@@ -240,7 +240,7 @@ class Dimensions:
         )
 
     def rounded(self, voxel_size_m: float) -> Dimensions:
-        """Return the measures without digits that say nothing.
+        """Return the measures without meaningless digits.
 
         Lengths in the power of ten that is at most a hundredth of a voxel, the heading in 1e-4 rad. The
         least-squares fits behind them carry the rounding of the FFT, some 1e-9 m: the sum of sectors and the

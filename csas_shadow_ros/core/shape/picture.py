@@ -1,4 +1,4 @@
-"""A result as a picture: its plan, its side, and the shadow that shows most."""
+"""A result as a picture: its plan, its side, and the most complete shadow."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ROOM = 0.4
 
 
 class ResultFigure(Figure):
-    """A figure that notebooks show also where pyplot was never imported."""
+    """A figure that notebooks show even without pyplot."""
 
     def png(self, dpi: float = 100.0) -> bytes:
         """Return the figure as a PNG file."""
@@ -38,7 +38,7 @@ class ResultFigure(Figure):
 
 
 def plot(result: Result) -> ResultFigure:
-    """Draw the plan, the side and the shadow that shows most; see `Result.plot`."""
+    """Draw the plan, the side and the most complete shadow; see `Result.plot`."""
     figure = ResultFigure(figsize=(11.5, 4.2), layout="constrained")
     FigureCanvasAgg(figure)
     plan, side, shadow = figure.subplots(1, 3)

@@ -1,4 +1,4 @@
-"""What a run leaves: plain data, the same whoever fed the views, and on topics as in a results folder."""
+"""The result of a run: plain data, the same for every source of views, on topics as in a results folder."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Quality:
 
 @dataclass(frozen=True)
 class ViewEvidence:
-    """What one view contributed.
+    """The contribution of one view.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class ViewEvidence:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A body that is no object, or was not looked at: where it is (x, y) and why.
+    """A body that is not an object, or was not examined: its place (x, y) and the reason.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class ObjectResult:
 
 @dataclass(eq=False)
 class Result:
-    """What a run leaves.
+    """The result of a run.
 
     Attributes
     ----------
@@ -219,12 +219,12 @@ class Result:
     datum: Datum | None = None
 
     def place_of(self, dimensions: Dimensions) -> Place | None:
-        """Return where on earth one of its objects is; None without a datum."""
+        """Return an object's place on earth; None without a datum."""
         return None if self.datum is None else self.datum.place_of(dimensions)
 
     @property
     def by_likelihood_alone(self) -> bool:
-        """Whether the mean likelihood of all views tells of an object that silhouettes are too little for."""
+        """Whether only the mean likelihood of all views shows the object, not silhouettes."""
         grid, other = self.grid, self.other_grid
         if grid is None or other is None or grid.method != "soft":
             return False

@@ -1,4 +1,4 @@
-"""The seabed's slope, told by the shadows that fall on it.
+"""The seabed's slope, from the shadows that fall on it.
 
 A track says how high the sonar is above a level. If the seabed slopes against that level, shadows are
 longer on one side of the circle and shorter on the other than the track makes them, and the carved shape
@@ -80,16 +80,16 @@ class SeabedSlope:
 
     @property
     def slope_rad(self) -> float:
-        """How steep it is."""
+        """Steepness of the slope."""
         return math.atan(math.hypot(*self.gradient))
 
     @property
     def believed(self) -> bool:
-        """Whether it is too steep to be chance."""
+        """Whether the slope is too steep to be chance."""
         return max(_LEAST_RAD, _SIGMAS * self.sigma) < self.slope_rad < _MOST_RAD
 
     def corrected(self, info: ViewInfo) -> ViewInfo:
-        """Return a view's geometry over this seabed if the slope is believed, as it is otherwise."""
+        """Return a view's geometry over this seabed if the slope is believed, unchanged otherwise."""
         return self.applied(info) if self.believed else info
 
     def applied(self, info: ViewInfo) -> ViewInfo:

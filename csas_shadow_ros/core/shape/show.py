@@ -21,7 +21,7 @@ _SMALL_DPI = 60
 
 
 def table(result: Result) -> list[tuple[str, str]]:
-    """Return what a result says as rows of name and value."""
+    """Return a result as rows of name and value."""
     quality = result.quality
     rows = [("verdict", result.verdict), ("quality", "; ".join((quality.verdict, *quality.reasons)))]
     if not result.objects:

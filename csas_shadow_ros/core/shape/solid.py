@@ -1,4 +1,4 @@
-"""Meshes of solids as others make them: whether they enclose a volume, and what can be put right.
+"""Meshes of solids from elsewhere: check that they enclose a volume, and repair what can be.
 
 What encloses a volume is told by counting each edge's faces with their direction: a surface is closed where
 each edge is passed as often one way as the other. So bodies may touch along faces, edges and corners, or
@@ -44,7 +44,7 @@ class Solid:
 
 
 def open_edges(faces: NDArray[Any]) -> int:
-    """Return the number of edges that faces do not pass as often one way as the other.
+    """Count the edges that faces pass more often in one direction than in the other.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def open_edges(faces: NDArray[Any]) -> int:
 
 
 def judge_solid(mesh: trimesh.Trimesh) -> Solid:
-    """Judge a mesh as a solid, and put right what leaves no doubt about its shape.
+    """Judge a mesh as a solid, and repair faults that leave no doubt about its shape.
 
     Doubled faces are dropped, faces that are turned the other way than their neighbours and bodies that are
     inside out are turned. A surface with holes stays as it is.
@@ -235,7 +235,7 @@ def _winding(point: NDArray[np.float64], triangles: NDArray[np.float64]) -> floa
 
 
 def apart(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a mesh whose bodies share no corner once it is written as float32: readers join corners.
+    """Return a mesh with separate corners for each body even as float32, since readers join corners.
 
     Bodies that touch are drawn in about their middles by a few of float32's steps, some micrometres at
     coordinates of metres. A mesh of which each edge has two faces is returned as it is.

@@ -66,7 +66,7 @@ def object_threshold(likelihood: NDArray[np.float32], method: str) -> float:
 
 
 def least_threshold(parameters: CarvingParameters) -> float | None:
-    """Return the threshold that is used whatever the voxels turn out to be; None if it depends on them."""
+    """Return the threshold if it is independent of the voxels, otherwise None."""
     if parameters.threshold:
         return parameters.threshold
     return {"consensus": _CONSENSUS, "hard": _HARD}.get(parameters.method)
@@ -155,7 +155,7 @@ def thresholded(
     views: NDArray[np.uint16],
     parameters: CarvingParameters,
 ) -> VoxelGrid:
-    """Make the grid of carved likelihoods, by the threshold that is given or by the automatic one.
+    """Make the grid of carved likelihoods, by the given or the automatic threshold.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def thresholded(
 def needed_threshold(
     likelihood: NDArray[np.float32], method: str, well_seen: NDArray[np.bool_] | None = None
 ) -> NDArray[np.float32]:
-    """Return what the threshold must be over for a voxel to be object, stray pieces included.
+    """Return the threshold at which each voxel becomes object, stray pieces included.
 
     ``needed_threshold(…) < t`` is the body of `occupied_voxels` at t before the small pieces are left
     out, for every t at once: what a threshold that is moved by hand works on.

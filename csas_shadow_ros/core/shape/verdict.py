@@ -1,4 +1,4 @@
-"""What a result says, and how far it can be trusted, with the reasons."""
+"""Verdict and quality of a result, with the reasons."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def _fit_of(result: Result, reasons: list[str]) -> int:
 
 
 def explained_share(result: Result) -> float | None:
-    """Return how much of the segmented shadow what was found casts, mean over the views; None if unknown."""
+    """Return the mean explained share of the segmented shadow over the views; None if unknown."""
     known = [one.unexplained for one in result.evidence.values() if math.isfinite(one.unexplained)]
     return 1.0 - float(np.mean(known)) if known else None
 
@@ -214,7 +214,7 @@ def _mean(values: list[float]) -> float:
 
 
 def cut_sides(grid: VoxelGrid) -> list[str]:
-    """Return the sides of a carved volume that its object reaches through: what lies beyond is not known."""
+    """Return the sides of a carved volume that its object reaches through."""
     body = grid.occupied
     ends = {
         "west side": body[:, :, 0],

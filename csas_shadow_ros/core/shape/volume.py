@@ -1,4 +1,4 @@
-"""The target, the volume that is carved round it, and the grid that carving leaves."""
+"""The target, the volume carved round it, and the carved grid."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Target:
         return 0.5 * math.hypot(self.size_m[0], self.size_m[1]) / (1.0 + 2.0 * MARGIN_SHARE)
 
     def volume(self, voxel_size_m: float) -> Volume:
-        """Return the lattice that is carved."""
+        """Return the lattice to carve."""
         return Volume.around(self.position_m, self.size_m, voxel_size_m)
 
 
@@ -126,7 +126,7 @@ class Volume:
 
 @dataclass(frozen=True, eq=False)
 class VoxelGrid:
-    """What carving leaves.
+    """The result of carving.
 
     Parameters
     ----------

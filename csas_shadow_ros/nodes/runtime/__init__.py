@@ -1,1 +1,1 @@
-"""What nodes are built of."""
+"""Building blocks of nodes."""

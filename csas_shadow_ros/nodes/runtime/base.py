@@ -89,7 +89,7 @@ _STRANGERS_S = 5.0
 
 
 def kind_of(reason: str) -> str:
-    """Return what kind of reason it is: the reason without its numbers."""
+    """Return the kind of a reason: the reason without its numbers."""
     return re.sub(r"-?\d[\d.,e+-]*", "#", reason)[:160]
 
 
@@ -177,42 +177,42 @@ class CsasNode(LifecycleNode):
         """Make publishers, inlets and sources."""
 
     def forget(self) -> None:
-        """Drop the state that a run leaves; called on cleanup."""
+        """Drop a run's state; called on cleanup."""
 
     def finish(self) -> None:
-        """Bring what must survive to an end; called on deactivation and shutdown."""
+        """Finish what must survive; called on deactivation and shutdown."""
 
     @classmethod
     def preload(cls) -> None:
-        """Load what the first view would have to wait for; needs no node, and takes no time again."""
+        """Load in advance what the first view needs; works without a node, and takes time only once."""
 
     def on_activated(self) -> None:
-        """Do what is to be done once when the work begins."""
+        """Do the work due once at activation."""
 
     def tick(self) -> None:
-        """Do what is to be done a few times a second."""
+        """Do the work due a few times a second."""
 
     def state_counts(self) -> dict[str, int]:
         """Return counts for the heartbeat, besides the common ones."""
         return {}
 
     def state_values(self) -> dict[str, str]:
-        """Return what else is worth telling in the heartbeat and in diagnostics."""
+        """Return further values for the heartbeat and diagnostics."""
         return {}
 
     def waiting(self) -> str:
-        """Say what the node waits for; empty if for nothing."""
+        """Say what the node waits for; empty if nothing."""
         return ""
 
     def keeps_its_state(self) -> bool:
-        """Say whether what the node holds is its own graph's alone, now that another one has gone.
+        """Say whether the node's state comes only from its own graph, after another one has gone.
 
         If not, it begins anew, as a node that was killed does: sources send it everything again.
         """
         return True
 
     def on_source(self, beat: Heartbeat) -> None:
-        """Take a source's heartbeat; only nodes that `follow_sources` get them."""
+        """Handle a source's heartbeat; only nodes that `follow_sources` receive them."""
 
     # Making entities that live from configure to cleanup
 
@@ -222,7 +222,7 @@ class CsasNode(LifecycleNode):
         return self.own_publisher(self.messages.cls(topic_of(topic).type_name), topic, profile)
 
     def own_publisher(self, kind: Any, topic: str, profile: Any) -> Publisher:
-        """Make a publisher of a type and topic that are not of the contract."""
+        """Make a publisher for a topic outside the contract."""
         made = self.create_publisher(kind, topic, profile)
         self._owned.append((self.destroy_publisher, made))
         return made
@@ -230,7 +230,7 @@ class CsasNode(LifecycleNode):
     def subscribe(
         self, topic: str, profile: Any, callback: Callable[[Any], None], *, raw: bool = False
     ) -> Subscription:
-        """Subscribe to a topic of the contract; nothing that the callback raises ends the node."""
+        """Subscribe to a topic of the contract; errors of the callback do not end the node."""
 
         def guarded(msg: Any) -> None:
             if self.active and (not self.rival or topic == "progress"):
@@ -247,7 +247,7 @@ class CsasNode(LifecycleNode):
         return made
 
     def unsubscribe(self, subscription: Subscription) -> None:
-        """Take a subscription back."""
+        """Remove a subscription."""
         self._owned.remove((self.destroy_subscription, subscription))
         self.strangers.unsubscribed(subscription)
         self.destroy_subscription(subscription)
@@ -283,13 +283,13 @@ class CsasNode(LifecycleNode):
         self._owned.append((self.destroy_timer, made))
 
     def background(self, callback: Callable[[], None]) -> Background:
-        """Make work that is done between other callbacks, a piece at a time, while the node is configured."""
+        """Make background work, done piece by piece between callbacks while the node is configured."""
         made = Background(self, callback)
         self._owned.append((Background.cancel, made))
         return made
 
     def start_waiting_work(self) -> None:
-        """Start what was triggered before the node had an executor."""
+        """Start work triggered before the node had an executor."""
         for _, entity in list(self._owned):
             if isinstance(entity, Background):
                 entity.start()
@@ -308,7 +308,7 @@ class CsasNode(LifecycleNode):
     # Other graphs
 
     def is_ours(self, item: ViewProgress | Heartbeat) -> bool:
-        """Say whether a message on `progress` is not another graph's; note who is there."""
+        """Say whether a message on `progress` belongs to this graph; note its sender."""
         if isinstance(item, Heartbeat):
             self.rivals.hear(item, self.instance)
             if not self.rival:
@@ -339,16 +339,16 @@ class CsasNode(LifecycleNode):
 
     @property
     def scene_frame(self) -> str:
-        """The one frame that messages may be in; empty: any, as long as a run has one."""
+        """The only accepted frame of messages; empty: any single frame per run."""
         return str(self.parameters.scene_frame)
 
     @property
     def trouble(self) -> str:
-        """What stops the node from working; empty if nothing does."""
+        """What stops the node from working; empty if nothing."""
         return self.rival or self.error
 
     def cannot(self, why: str) -> None:
-        """Say, at once and in every heartbeat, that the node can take nothing, or again can (empty)."""
+        """Announce, at once and in every heartbeat, why the node cannot work; empty: it can again."""
         before, self.unable = self.unable, why
         if why and not before:
             self.get_logger().error(f"{why}: receiving nothing")
@@ -360,7 +360,7 @@ class CsasNode(LifecycleNode):
     # Errors
 
     def guard(self, where: str, work: Callable[..., None], *args: Any) -> None:
-        """Run a piece of work: whatever goes wrong is counted and named, and the node goes on."""
+        """Run a piece of work; count and name any error, and continue."""
         start = time.perf_counter()
         try:
             work(*args)
@@ -374,12 +374,12 @@ class CsasNode(LifecycleNode):
             self.busy_s += time.perf_counter() - start
 
     def fault(self, where: str, error: BaseException) -> None:
-        """Count an error that is none of ours, with its traceback in the log."""
+        """Count an unexpected error, with its traceback in the log."""
         self.reject(f"{where}: {type(error).__name__}: {error}", level="error")
         self.get_logger().debug("".join(traceback.format_exception(error)))
 
     def reject(self, reason: str, *, level: str = "warn") -> None:
-        """Count something that cannot be used, and name it in the log: each kind at most every 10 s."""
+        """Count an unusable item, and name it in the log: each kind at most every 10 s."""
         self.counts["rejected"] += 1
         kind = kind_of(reason)
         if kind not in self.reasons and len(self.reasons) >= _MAX_KINDS:
@@ -410,11 +410,11 @@ class CsasNode(LifecycleNode):
         return int(self.get_clock().now().nanoseconds)
 
     def send_report(self, item: ViewProgress) -> None:
-        """Publish what became of a view."""
+        """Publish the fate of a view."""
         self._reports.publish(progress_to_msg(self.messages, item))
 
     def tell_now(self) -> None:
-        """Send the heartbeats at once: others wait for what has just changed."""
+        """Send the heartbeats at once, because others wait for a change."""
         with self._beat_lock:
             if self.active:
                 self._send_beats()
@@ -484,7 +484,7 @@ class CsasNode(LifecycleNode):
     # Lifecycle
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Make everything; refuse with one line if that cannot be done."""
+        """Set everything up; refuse with one line if that fails."""
         self._configured = True
         # Whatever an earlier configuration reported is forgotten with its state.
         self.instance = instance_of(self.rivals.graph_id, uuid.uuid4().hex[:12])
@@ -515,7 +515,7 @@ class CsasNode(LifecycleNode):
             self.tick()
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Begin to work."""
+        """Start working."""
         self.active = True
         self._beat_stop.clear()
         self._beat_thread = threading.Thread(target=self._beat_on, name="heartbeat", daemon=True)
@@ -535,7 +535,7 @@ class CsasNode(LifecycleNode):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Drop everything, so that another run can be configured."""
+        """Drop everything, ready for another configuration."""
         self.finish()
         self._destroy_owned()
         self.forget()
@@ -543,7 +543,7 @@ class CsasNode(LifecycleNode):
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Come to an end from whatever state."""
+        """Shut down from any state."""
         self.stop()
         return super().on_shutdown(state)
 
@@ -574,7 +574,7 @@ class CsasNode(LifecycleNode):
             destroy(entity)
 
     def start(self) -> bool:
-        """Configure and activate; False if the node refuses, which is logged."""
+        """Configure and activate; log and return False if the node refuses."""
         ok = TransitionCallbackReturn.SUCCESS
         return bool(self.trigger_configure() == ok and self.trigger_activate() == ok)
 
@@ -604,7 +604,7 @@ class CsasNode(LifecycleNode):
 
 
 class Background:
-    """Work that is done between a node's other callbacks, a piece at a time.
+    """Work done piece by piece between a node's other callbacks.
 
     A task of the executor, not a guard condition: an executor that works by events cannot see those.
 
@@ -622,12 +622,12 @@ class Background:
         self._triggered = self._queued = False
 
     def trigger(self) -> None:
-        """Do a piece of it soon; asked for several times before that, it is done once."""
+        """Do a piece of it soon; several triggers before that count as one."""
         self._triggered = True
         self.start()
 
     def start(self) -> None:
-        """Hand it to the executor, if it was triggered and there is one."""
+        """Hand it to the executor, if triggered and there is one."""
         executor = self._node.executor if self._node is not None else None
         if self._triggered and not self._queued and executor is not None:
             self._queued = True
@@ -680,7 +680,7 @@ class Unlatched:
         self.subscription: Subscription | None = subscribe(self._profile)
 
     def look(self) -> None:
-        """Subscribe, or take the subscription back, as publishers have come and gone."""
+        """Subscribe or unsubscribe as publishers come and go."""
         count, now = self._node.count_publishers(self._topic), time.monotonic()
         # Who they are takes longer to ask than how many; one may have taken another's place.
         if count == self._publishers and now - self._asked_s < _WHO_S:
@@ -706,7 +706,7 @@ class Unlatched:
 
 
 class Strangers:
-    """Publishers of a node's topics of which it hears nothing: their type or their QoS does not match.
+    """Publishers that a node cannot hear, because their type or QoS does not match.
 
     ROS says nothing of the one, and of the other only a line of the middleware's own.
 
@@ -739,7 +739,7 @@ class Strangers:
         self.unheard.clear()
 
     def look(self) -> None:
-        """See who publishes, and name in the log, once, whoever cannot be heard."""
+        """Check the publishers, and log once each one that cannot be heard."""
         ours: dict[str, list[Subscription]] = {}
         for subscription in self._subscriptions:
             ours.setdefault(subscription.topic_name, []).append(subscription)
@@ -793,7 +793,7 @@ def _type_name(kind: Any) -> str:
 
 
 class Inlet:
-    """A stream of image and camera_info pairs that a node takes.
+    """A stream of image and camera_info pairs that a node receives.
 
     Parameters
     ----------
@@ -843,7 +843,7 @@ class Inlet:
         node.inlets.append(self)
 
     def close(self) -> None:
-        """Take no more of the stream; say goodbye, so that nobody waits."""
+        """Stop receiving the stream, and say goodbye so that nobody waits."""
         self.node.leave(self)
         for subscription in self._subscriptions:
             self.node.unsubscribe(subscription)
@@ -890,7 +890,7 @@ class Inlet:
             self.report(stamp, outcome)
 
     def refuse(self, stamp: int, info: Any, reason: str) -> None:
-        """Count a view that cannot be used, name it, and tell the sources so."""
+        """Count an unusable view, name it, and report it to the sources."""
         self.node.reject(reason)
         self.report(stamp, REJECTED, reason, **self._aspect_of(info))
 
@@ -903,12 +903,12 @@ class Inlet:
         return {"aspect_deg": f"{math.degrees(aspect):.6f}"}
 
     def release(self) -> None:
-        """Work on the views that were held, as far as they need not wait any longer."""
+        """Process the held views that need not wait any longer."""
         for _ in range(len(self.held)):
             self._work_or_hold(*self.held.popleft())
 
     def report(self, stamp_ns: int, outcome: str, reason: str = "", **more: str) -> None:
-        """Tell the sources what became of a view."""
+        """Report the fate of a view to the sources."""
         self.node.counts["out" if outcome == PUBLISHED else outcome] += outcome != REJECTED
         level = Level.WARN if outcome == REJECTED else Level.OK
         values = {"role": self.role, "input": self.stream, **self._for_target(), **more}
@@ -922,7 +922,7 @@ class Inlet:
         self._pairer.orphans.clear()
 
     def give_up_lonely(self) -> None:
-        """Drop messages whose partner has not come while nothing else came; refuse what waited long."""
+        """Drop messages without a partner after a silence; refuse those that waited too long."""
         if self.held:
             self.release()
         if time.monotonic() - self._last_s > _LONELY_S:
@@ -994,7 +994,7 @@ class Source:
         node.sources.append(self)
 
     def apply(self, parameters: Any) -> None:
-        """Take changed parameters over."""
+        """Apply changed parameters."""
         self.flow.window = parameters.window
         self.flow.resend_s = parameters.resend_s
         self.flow.sink_wait_s = parameters.sink_wait_s
@@ -1057,7 +1057,7 @@ class Source:
         self.flow.notes.clear()
 
     def refused(self, stamp_ns: int, reason: str, **values: str) -> None:
-        """Report a view that cannot be made."""
+        """Report a view that the source cannot make."""
         self.node.reject(reason)
         values |= {"role": "source", "input": self.stream}
         self.node.send_report(
@@ -1065,7 +1065,7 @@ class Source:
         )
 
     def counts(self) -> dict[str, int]:
-        """Return how far it is."""
+        """Return the progress counts."""
         flow = self.flow
         return {
             "total": flow.total,
@@ -1079,7 +1079,7 @@ class Source:
         }
 
     def beat(self, *, leaving: bool) -> Heartbeat:
-        """Make the heartbeat: it tells the sinks for whom the run is at its end."""
+        """Make the heartbeat, which tells finished sinks that the run is over."""
         # Also while the node computes, when nobody else would notice that somebody has come.
         self.flow.meet(self.image.get_subscription_count())
         values = {"stream": self.stream}
@@ -1117,18 +1117,18 @@ class ViewOutlet:
 
     @property
     def wanted(self) -> bool:
-        """Whether anybody takes the stream: what nobody takes need not even be made."""
+        """Whether anybody subscribes to the stream; otherwise it need not be computed."""
         return bool(self._image.get_subscription_count() or self._info.get_subscription_count())
 
     def send(self, view: View, *, trusted: bool = True) -> None:
-        """Publish a view; its stamp goes out unchanged. `trusted` as of `view_to_msgs`."""
+        """Publish a view with its stamp unchanged; `trusted` as for `view_to_msgs`."""
         image, info = view_to_msgs(self._node.messages, view, self._stream, trusted=trusted)
         self._info.publish(info)
         self._image.publish(image)
 
 
 class TargetInlet:
-    """What is to be carved: given by parameter, or from topics `target` and `search`; never guessed.
+    """What to carve: from parameters, or from topics `target` and `search`; never guessed.
 
     Parameters
     ----------
@@ -1167,12 +1167,12 @@ class TargetInlet:
 
     @property
     def target(self) -> Target | None:
-        """The body that the run is about; None: there is none, or it is not known."""
+        """The run's target; None if absent or unknown."""
         return self.decision.target
 
     @property
     def stamp(self) -> str:
-        """Stamp of the target, as reports name it; empty where it is given."""
+        """Stamp of the target, as reports name it; empty for a given target."""
         return self._node.target_stamp
 
     def _take_search(self, msg: Any) -> None:
@@ -1217,7 +1217,7 @@ class TargetInlet:
         return None if box is None else Target((box.centre_m[0], box.centre_m[1]), box.size_m)
 
     def missing(self) -> str:
-        """Say why there is nothing to go by yet; empty once it is known."""
+        """Say why the target is unknown; empty once it is known."""
         return "" if self.known else "no target position: none received on topic target, none given"
 
     def hold(self, _: int) -> tuple[str, float]:
@@ -1226,7 +1226,7 @@ class TargetInlet:
 
 
 def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> int:
-    """Run a node until SIGINT or SIGTERM; the console scripts end up here.
+    """Run a node until SIGINT or SIGTERM; all console scripts use this.
 
     Returns
     -------
@@ -1311,7 +1311,7 @@ def _is_orphan() -> bool:
 
 
 def make_executor(context: Context) -> Executor:
-    """Make the executor with the least work of its own.
+    """Make the executor with the least overhead.
 
     The one that waits by sets gathers all of a node's entities, services and timers among them, for each
     message anew: 0.5 ms and more of Python, which a graph pays thousands of times a run.

@@ -1,4 +1,4 @@
-"""Flow control: no view is lost however slow a consumer is, memory is bounded, nothing deadlocks.
+"""Flow control: no view is lost, however slow a consumer is; memory is bounded; nothing deadlocks.
 
 The rules are told in ``docs/flow_control.md``. This module holds them without any ROS, so that they
 can be tested with a clock that the test turns.
@@ -35,7 +35,7 @@ def place_of(stream: str) -> int:
 
 @dataclass
 class Peer:
-    """A consumer that reports: what its messages have told of it.
+    """A consumer that reports: its state as told by its messages.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Peer:
 
     @property
     def key(self) -> str:
-        """Whose reports count as this peer's.
+        """Key of the reports that count as this peer's.
 
         A sink's state dies with its process, so only that process' own reports count. A stage has
         no state: whatever any process of its name has passed on is passed on.
@@ -88,7 +88,7 @@ class _Sent:
 
 @dataclass
 class Flow:
-    """Decides which view a source sends next, and knows when all are done.
+    """Decides which view a source sends next, and when all are done.
 
     A view is done when every live last consumer has reported it, or a stage before that consumer
     has refused it. Last consumers are all sinks, and the stages behind which nobody reports.
@@ -166,13 +166,13 @@ class Flow:
         self._recount()
 
     def refuse(self, stamp: int, reason: str) -> None:
-        """Take a view back that the source cannot make after all."""
+        """Withdraw a view that the source cannot make after all."""
         self._refused[stamp] = reason
         self._in_flight.pop(stamp, None)
         self._missing.pop(stamp, None)
 
     def begin_again(self, target: str) -> None:
-        """Forget all views and what was reported of them: they are offered again, for another target."""
+        """Forget all views and their reports, to offer them again for another target."""
         self.target = target
         self.lost.clear()
         for kept in (self._stamps, self._refused, self._reports, self._rejected_at, self._in_flight):
@@ -183,7 +183,7 @@ class Flow:
     # What consumers say
 
     def heard(self, item: ViewProgress | Heartbeat) -> None:
-        """Take a report or a heartbeat of a consumer."""
+        """Handle a report or a heartbeat of a consumer."""
         role = item.role if isinstance(item, Heartbeat) else item.values.get("role", "stage")
         if role == "source":
             return
@@ -268,7 +268,7 @@ class Flow:
             del self._missing[stamp]
 
     def transported(self) -> None:
-        """Say that the transport has delivered everything on its way (used where nobody reports)."""
+        """State that the transport has delivered everything in flight (used if nobody reports)."""
         for stamp in list(self._in_flight):
             self._reports.setdefault(TRANSPORT, set()).add(stamp)
             if self._is_done(stamp):
@@ -286,11 +286,11 @@ class Flow:
     # Who must have what
 
     def live(self) -> list[Peer]:
-        """Return the consumers that are there."""
+        """Return the present consumers."""
         return [p for p in self.peers.values() if p.alive]
 
     def sinks(self) -> list[Peer]:
-        """Return the sinks that are there."""
+        """Return the present sinks."""
         return [p for p in self.live() if p.role == "sink"]
 
     def _is_done(self, stamp: int) -> bool:
@@ -344,7 +344,7 @@ class Flow:
         self._choose_leaves()
 
     def meet(self, subscribers: int) -> None:
-        """Note when somebody was there for the first time; another thread than the one that looks may."""
+        """Note the first appearance of a consumer; callable from any thread."""
         if self._met_s is None and (subscribers or self.peers):
             self._met_s = self.clock()
 
@@ -368,11 +368,11 @@ class Flow:
 
     @property
     def acknowledged_by_transport(self) -> bool:
-        """True where nobody reports: then the node calls `transported` when all is delivered."""
+        """True if nobody reports; the node then calls `transported` on delivery."""
         return not self._leaves and self._subscribers > 0
 
     def waiting_for(self) -> str:
-        """Say what the source waits for before it sends anything; empty if for nothing."""
+        """Say what the source waits for before it sends; empty if nothing."""
         now = self.clock()
         new = self._met_s is not None and now - self._met_s < self.settle_s
         if new and self._all_there():
@@ -402,7 +402,7 @@ class Flow:
         return last != _LAST and stages >= set(range(place_of(self.stream), last))
 
     def next(self, *, fresh: bool = True) -> int | None:
-        """Return the stamp of the view to send now, None if none is to be sent; it counts as sent.
+        """Return the stamp of the view to send now, which then counts as sent; None if there is none.
 
         Parameters
         ----------
@@ -458,32 +458,32 @@ class Flow:
 
     @property
     def total(self) -> int:
-        """Views that the source has."""
+        """Number of views of the source."""
         return len(self._stamps)
 
     @property
     def in_flight(self) -> int:
-        """Views on their way."""
+        """Views in flight."""
         return len(self._in_flight)
 
     @property
     def pending(self) -> bool:
-        """Whether a view that was offered is still to be sent, or on its way."""
+        """Whether an offered view is still unsent or in flight."""
         return any(s not in self.lost for s in self._missing)
 
     @property
     def refused(self) -> dict[int, str]:
-        """Views that the source could not make after all, and why."""
+        """Views that the source could not make, and why."""
         return self._refused
 
     @property
     def done(self) -> int:
-        """Views that need not be sent (again) to anybody who is there."""
+        """Views that no present consumer needs (again)."""
         return self.total - len(self._missing)
 
     @property
     def finished(self) -> bool:
-        """Whether there is nothing left to do for anybody who is there or waited for."""
+        """Whether nothing is left to do for any present or awaited consumer."""
         if not self._stamps or self.more_to_come or self._gone or self._in_flight:
             return False
         if self.waiting_for():
@@ -492,6 +492,6 @@ class Flow:
         return nobody or not self.pending
 
     def finished_for(self) -> Iterator[str]:
-        """Iterate the instances of the consumers that have, or will never have, every view."""
+        """Iterate the consumers (instances) that have, or will never have, every view."""
         if self.finished:
             yield from (p.instance for p in self._leaves)

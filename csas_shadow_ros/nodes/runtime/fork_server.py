@@ -1,4 +1,4 @@
-"""A process that nodes are forked from: what they all load is loaded once.
+"""A process that forks nodes, so that common modules load only once.
 
 A node alone imports libraries and loads compiled kernels for one to two seconds of processor time, six
 nodes for ten on two cores. Here the first has to, the next have only what is their own left to load, and
@@ -45,7 +45,7 @@ def load(node: str) -> Any:
 
 
 def fork(main: Any, node: str, arguments: list[str], log: str, answers: int) -> int:
-    """Start a node in a process of its own, whose parent is not this one; return its id.
+    """Start a node in its own process, detached from this one; return its id.
 
     Parameters
     ----------

@@ -86,7 +86,7 @@ class Reach:
 
 
 def make_hearing(make: Callable[[], Made], take_back: Callable[[Made], None]) -> Made:
-    """Make something that has a participant of its own, again if that has not got its ports.
+    """Make an object with its own participant, again if that lacks its ports.
 
     Two processes that are killed at once do not let go of all they hold at once. A third that begins just
     then may find one's socket free and its lock taken; the middleware goes on without that port, and others

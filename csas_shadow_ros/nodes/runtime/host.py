@@ -1,4 +1,4 @@
-"""What the parts of a node need of whatever they are parts of: a node of ours, or somebody else's."""
+"""What inlets and outlets need from their node, ours or an outside one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class Host(Protocol):
-    """Whoever has inlets and outlets: `CsasNode`, and `csas_shadow_ros.client` within an outside node."""
+    """Owner of inlets and outlets: `CsasNode`, or `csas_shadow_ros.client` in an outside node."""
 
     #: Identifies the running process; a successor has another one.
     instance: str
@@ -29,11 +29,11 @@ class Host(Protocol):
 
     @property
     def scene_frame(self) -> str:
-        """The one frame that messages may be in; empty: any, as long as a run has one."""
+        """The only accepted frame of messages; empty: any single frame per run."""
 
     @property
     def trouble(self) -> str:
-        """What stops it from working; empty if nothing does."""
+        """What stops it from working; empty if nothing."""
 
     def publisher(self, topic: str, profile: Any) -> Any:
         """Make a publisher of a topic of the contract."""
@@ -41,10 +41,10 @@ class Host(Protocol):
     def subscribe(
         self, topic: str, profile: Any, callback: Callable[[Any], None], *, raw: bool = False
     ) -> Any:
-        """Subscribe to a topic of the contract; nothing that the callback raises ends the node."""
+        """Subscribe to a topic of the contract; errors of the callback do not end the node."""
 
     def unsubscribe(self, subscription: Any) -> None:
-        """Take a subscription back."""
+        """Remove a subscription."""
 
     def count_publishers(self, topic: str) -> int:
         """Return how many publishers of a topic are known."""
@@ -53,10 +53,10 @@ class Host(Protocol):
         """Say goodbye for one inlet."""
 
     def reject(self, reason: str) -> None:
-        """Count and name something that cannot be used."""
+        """Count and name an unusable item."""
 
     def send_report(self, item: ViewProgress) -> None:
-        """Publish what became of a view."""
+        """Publish the fate of a view."""
 
     def now_ns(self) -> int:
         """Return the node's time."""
@@ -65,4 +65,4 @@ class Host(Protocol):
         """Return the counts that every heartbeat carries."""
 
     def state_values(self) -> dict[str, str]:
-        """Return what else is worth telling in the heartbeat."""
+        """Return further values for the heartbeat."""

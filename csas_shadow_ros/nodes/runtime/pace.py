@@ -1,4 +1,4 @@
-"""When to publish a result that grows with every view."""
+"""Decide when to publish a growing result."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _QUIET_S = 0.06
 
 
 class Growing:
-    """Publishes a growing result now and then while somebody looks, and once more when it is complete.
+    """Publishes a growing result at intervals while somebody subscribes, and once when complete.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Growing:
         self._cost_s = 0.0
 
     def set_rate(self, hz: float) -> None:
-        """Publish an unfinished result so often at most; 0: never."""
+        """Limit the rate of unfinished results; 0: never publish them."""
         self.period_s = 1.0 / hz if hz > 0.0 else math.inf
 
     def changed(self) -> None:
@@ -56,7 +56,7 @@ class Growing:
         self._changed_s = time.monotonic()
 
     def source_says(self, ended: bool) -> None:
-        """Take a source's word whether every view has come."""
+        """Note a source's statement whether every view has arrived."""
         self._source_s, self._ended = time.monotonic(), ended
 
     @property
@@ -70,13 +70,13 @@ class Growing:
         self.complete = self.final = self._dirty = self._open = self._ended = False
 
     def finish(self) -> None:
-        """Publish the end result now, whatever anybody has said."""
+        """Publish the final result now, unconditionally."""
         self.final = True
         self._do(time.monotonic())
         self.complete = True
 
     def tick(self, now: float) -> None:
-        """Publish if it is time to."""
+        """Publish if due."""
         self.final = self._ended
         if self._ended and not self.complete:
             # Also where nothing came at all: that is a result too.

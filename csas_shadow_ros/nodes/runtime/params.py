@@ -1,4 +1,4 @@
-"""Parameters of the nodes: the core's dataclasses, plus what only a node needs.
+"""Parameters of the nodes: the core's dataclasses, plus those that only a node needs.
 
 One dataclass a node drives its ROS parameter descriptors, ``config/csas_shadow.yaml`` and the README's
 table; a test holds the three together. ``python -m csas_shadow_ros.nodes.runtime.params`` prints the table,
@@ -68,7 +68,7 @@ class SnapshotParameters(Parameters):
 
 @dataclass(frozen=True)
 class FocusParameters(Parameters):
-    """Where shadows are focused."""
+    """Parameters of the focus of shadows."""
 
     target: str = bounded(
         "auto",
@@ -82,7 +82,7 @@ class FocusParameters(Parameters):
 
 @dataclass(frozen=True)
 class BoxParameters(Parameters):
-    """Where the target is and how large it is, for nodes behind the one that finds it."""
+    """Position and size of the target, for nodes behind the one that finds it."""
 
     target: str = bounded(
         "auto",
@@ -133,7 +133,7 @@ class VoxelCarverNodeParameters(
     CarvingParameters,
     PlaceParameters,
 ):
-    """Parameters of `voxel_carver`; those of earlier stages measure the target and make further bodies."""
+    """Parameters of `voxel_carver`; those of earlier stages measure the target and carve further bodies."""
 
     parent_frame: str = bounded(
         "earth",
@@ -160,7 +160,7 @@ class VoxelCarverNodeParameters(
     )
 
     def check(self) -> None:
-        """Refuse half a place."""
+        """Refuse a latitude without a longitude, or the reverse."""
         super().check()
         if math.isnan(self.parent_lat_deg) != math.isnan(self.parent_lon_deg):
             raise ParameterError("only one of parent_lat_deg, parent_lon_deg is given; expected both or none")
@@ -258,7 +258,7 @@ def part(parameters: Parameters, kind: type[P]) -> P:
 
 
 def from_overrides(kind: type[P], overrides: Mapping[str, Any]) -> P:
-    """Make a node's parameters from what the command line or a file gives.
+    """Make a node's parameters from command-line or file values.
 
     Raises
     ------
@@ -269,7 +269,7 @@ def from_overrides(kind: type[P], overrides: Mapping[str, Any]) -> P:
 
 
 def expected_of(field: dataclasses.Field[Any]) -> str:
-    """Say which values a field takes."""
+    """Say which values a field accepts."""
     meta = field.metadata
     if meta["choices"]:
         return ", ".join(meta["choices"])
@@ -289,7 +289,7 @@ def description_of(field: dataclasses.Field[Any]) -> str:
 
 
 def declare(node: Any, parameters: Parameters) -> None:
-    """Declare a node's parameters with descriptors that say their bounds.
+    """Declare a node's parameters with descriptors of their bounds.
 
     Parameters
     ----------

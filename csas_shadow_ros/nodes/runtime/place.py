@@ -1,4 +1,4 @@
-"""Where on earth a scene is, by parameters or topic `origin`: told on `scene_transform` and `/tf_static`."""
+"""A scene's place on earth, from parameters or topic `origin`, for `scene_transform` and `/tf_static`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MOST = 64
 
 
 class PlaceOnEarth:
-    """The datum of each run of a node, and who is told of it.
+    """The datum of each run of a node, and its publishers.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class PlaceOnEarth:
         self._on_changed()
 
     def publish(self, frame: str, run_ns: int | None, last_ns: int | None) -> Datum | None:
-        """Return the datum of a run, and tell of it.
+        """Return and publish the datum of a run.
 
         Parameters
         ----------

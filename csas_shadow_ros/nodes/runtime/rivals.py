@@ -1,4 +1,4 @@
-"""Other graphs in a node's namespace: no view says whose it is, so whoever hears one takes and sends none.
+"""Detect other graphs in a namespace: views carry no owner, so a node that hears another graph stops.
 
 Needs no ROS, so that it can be tested with a clock that the test turns.
 """
@@ -20,7 +20,7 @@ _DEAF_S = 1.0
 
 
 class Rivals:
-    """Tells which other graphs are at work in a node's namespace.
+    """Detects other graphs in a node's namespace.
 
     Parameters
     ----------
@@ -52,12 +52,12 @@ class Rivals:
         self._looked_s = clock()
 
     def is_other(self, instance: str) -> bool:
-        """Say whether a process belongs to another graph; one that names none belongs to any."""
+        """Say whether a process belongs to another graph; without an identity it belongs to any."""
         theirs = graph_of(instance)
         return bool(theirs and self.graph_id and theirs != self.graph_id)
 
     def hear(self, beat: Heartbeat, own_instance: str) -> None:
-        """Take a heartbeat."""
+        """Handle a heartbeat."""
         if own_instance and beat.instance.startswith(own_instance):
             return
         now, other = self._clock(), self.is_other(beat.instance)
@@ -74,7 +74,7 @@ class Rivals:
             self._there[beat.instance] = (now, f"another {beat.node}")
 
     def look(self) -> str:
-        """Say who is there; empty if nobody. Call it a few times a second."""
+        """Name the other graph; empty if none. Call it a few times a second."""
         now = self._clock()
         deaf_s, self._looked_s = now - self._looked_s, now
         for instance, (heard_s, who) in list(self._there.items()):

@@ -1,4 +1,4 @@
-"""Which run a message belongs to: the one whose track covers its stamp."""
+"""Assign messages to runs: a message belongs to the run with a track over its stamp."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HOLD_S = 10.0
 
 
 class RunFollower:
-    """Follows topic `track` and tells runs apart by it.
+    """Follows topic `track` and separates runs by it.
 
     Parameters
     ----------
@@ -45,15 +45,15 @@ class RunFollower:
             self._on_track(name, dict(self.book.renamed))
 
     def last_of(self, run_ns: int | None) -> int | None:
-        """Return the stamp of a run's last pose; None where no track tells it."""
+        """Return the stamp of a run's last pose; None without a track."""
         return self.book.span(run_ns)[1] if run_ns in self.book.names and run_ns is not None else None
 
     def run_of(self, stamp_ns: int) -> int | None:
-        """Return the name of the run whose track covers a stamp; None if none does."""
+        """Return the name of the run with a track over this stamp; None if there is none."""
         return self.book.run_of(stamp_ns)
 
     def hold(self, stamp_ns: int) -> tuple[str, float]:
-        """Say why a message of a stamp has to wait, and for how long at most (s); empty if it need not.
+        """Say why a message must wait, and for how long at most (s); empty if it need not.
 
         Where there is no track at all, all that comes is of one run.
         """
@@ -63,7 +63,7 @@ class RunFollower:
         return f"no track covers its stamp (tracks go from {spans})", HOLD_S
 
     def image_hold(self, stamp_ns: int) -> tuple[str, float]:
-        """Say the same of an image, which has to wait for a track for as long as there is none at all."""
+        """Say the same for an image, which waits for a track as long as there is none at all."""
         if not self.book.names:
             return "there is no track", math.inf
         return self.hold(stamp_ns)

@@ -1,4 +1,4 @@
-"""Nodes that are to be secured (SROS 2), and cannot be: one line instead of the middleware's traceback."""
+"""Replace the middleware's traceback by one line if a node cannot be secured (SROS 2)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from csas_shadow_ros.core.errors import ParameterError
 
 @contextlib.contextmanager
 def security_told() -> Iterator[None]:
-    """Tell why a node cannot be made, where ROS_SECURITY_ENABLE asks for security.
+    """Say why a node cannot be made under ROS_SECURITY_ENABLE.
 
     A middleware without security, missing keys or wrong ones: none of them goes away by another try, and a
     node never works in the clear instead.

@@ -1,4 +1,4 @@
-"""Shared memory and ports of the middleware: whose they are, and what killed processes left of them."""
+"""Shared memory and ports of the middleware: owners, and leftovers of killed processes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def ports_of(domain_id: int) -> range:
 
 
 def bound(port: int) -> socket.socket | None:
-    """Bind a UDP port, on all addresses and for this socket alone; None if somebody has it."""
+    """Bind a UDP port exclusively on all addresses; None if it is taken."""
     made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         made.bind(("", port))
@@ -35,7 +35,7 @@ def bound(port: int) -> socket.socket | None:
 
 
 def unused(domain_id: int) -> bool:
-    """Say whether no participant of a domain runs here: each binds two ports of its own, or a shared one."""
+    """Say whether no participant of a domain runs here, by the ports that each one binds."""
     ports = ports_of(domain_id)
     for port in (*ports[:2], *ports[10:]):
         probe = bound(port)
@@ -46,7 +46,7 @@ def unused(domain_id: int) -> bool:
 
 
 def free_shared_memory() -> int:
-    """Return how many bytes are free for shared memory: a container often has 64 MB of it."""
+    """Return the free shared memory in bytes; containers often have 64 MB."""
     try:
         return shutil.disk_usage("/dev/shm").free
     except OSError:
@@ -68,7 +68,7 @@ def segments_of(pid: int) -> set[Path]:
 
 
 def remove_segment(segment: Path) -> None:
-    """Remove a segment that a killed process left; one that is gone already, or is owned, stays as it is."""
+    """Remove a segment left by a killed process, unless it is gone or owned."""
     owner = segment.with_name(segment.name + _OWNER)
     with contextlib.suppress(OSError), owner.open("rb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -77,7 +77,7 @@ def remove_segment(segment: Path) -> None:
 
 
 def remove_strays(since_s: float = 0.0, until_s: float = math.inf) -> None:
-    """Remove this user's segments that were made in a span of time (s since 1970) and whose owner died.
+    """Remove this user's segments made in a time span (s since 1970) by processes that died.
 
     A second old they must be: whoever makes one may not hold its lock yet.
     """
@@ -91,7 +91,7 @@ def remove_strays(since_s: float = 0.0, until_s: float = math.inf) -> None:
 
 
 def remove_ports(domain_id: int) -> None:
-    """Remove the ports in shared memory that killed processes left in a domain that nobody uses any more."""
+    """Remove shared-memory ports left by killed processes in a domain no longer in use."""
     for number in ports_of(domain_id):
         port = Path(f"{_SEGMENTS}port{number}")
         owner = port.with_name(port.name + _OWNER)
@@ -104,7 +104,7 @@ def remove_ports(domain_id: int) -> None:
 
 
 def tidy_up_after_a_killed_graph(domain_id: int, since_s: float) -> None:
-    """Remove the shared memory of a graph whose launching process was killed.
+    """Remove the shared memory of a graph after its launching process was killed.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Entry points of the nodes' executables, which can be stopped from their first moment on.
+"""Entry points of the nodes' executables, which stop cleanly from their first moment.
 
 A node imports libraries for a second or more, and some of them swallow the KeyboardInterrupt that
 Ctrl-C raises meanwhile: the node would start after all, and `ros2 launch` wait for it in vain.
