@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ..core.frame_name import SCENE_FRAME
 from ..core.parameters import PlaceParameters
 from .console import OK, Console
 from .options import output_options
+
+if TYPE_CHECKING:
+    from ..simulation import SimulatedRun
 
 #: Shadows may leave the image by so much of its half side before a simulation is said to be too small.
 _MAX_REACH = 1.6
@@ -33,10 +38,21 @@ def add_simulate(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _simulate_options(p: argparse.ArgumentParser) -> None:
-    from ..simulation import PROFILES, TARGETS
-
     p.add_argument("out_bag", metavar="OUT_BAG", help="bag to make (a rosbag2 directory)")
     p.add_argument("--overwrite", action="store_true", help="replace a bag that is there")
+    _scene_options(p)
+    _image_options(p)
+    _sonar_options(p)
+    _place_options(p.add_argument_group("place on earth, for topic origin"))
+    _fault_options(p.add_argument_group("faults"))
+    _profile_options(p.add_argument_group("image and circle, instead of the profile's"))
+    output_options(p)
+
+
+def _scene_options(p: argparse.ArgumentParser) -> None:
+    """Add what is looked at, and by what kind of run."""
+    from ..simulation import PROFILES, TARGETS
+
     p.add_argument(
         "--profile",
         choices=list(PROFILES),
@@ -56,6 +72,10 @@ def _simulate_options(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--heading-deg", type=float, default=0.0, metavar="DEG", help="turn of the target, counter-clockwise"
     )
+
+
+def _image_options(p: argparse.ArgumentParser) -> None:
+    """Add how the image is written."""
     p.add_argument(
         "--encoding",
         choices=("32FC2", "64FC2", "16SC2", "8SC2"),
@@ -82,6 +102,10 @@ def _simulate_options(p: argparse.ArgumentParser) -> None:
         default=1,
         help="phase convention of the image (default 1)",
     )
+
+
+def _sonar_options(p: argparse.ArgumentParser) -> None:
+    """Add how the sonar goes round, and how loud it hears the target."""
     p.add_argument(
         "--echo-db", type=float, default=12.0, metavar="DB", help="target's echo over the seabed (default 12)"
     )
@@ -93,126 +117,123 @@ def _simulate_options(p: argparse.ArgumentParser) -> None:
         metavar="DEG",
         help="aspect of the first pose (default 0)",
     )
-    place = p.add_argument_group("place on earth, for topic origin")
+
+
+def _place_options(group: argparse._ArgumentGroup) -> None:
+    """Add where on earth the scene is."""
     for flag, text in (
         ("--origin-lat-deg", "latitude of the scene's origin, WGS-84 (default: no origin is written)"),
         ("--origin-lon-deg", "its longitude"),
         ("--origin-sigma-m", "its standard deviation, along east and north (default: not known)"),
     ):
-        place.add_argument(
+        group.add_argument(
             flag, type=float, metavar=flag.rpartition("-")[2].upper(), default=math.nan, help=text
         )
-    place.add_argument(
+    group.add_argument(
         "--scene-frame",
         default=SCENE_FRAME,
         metavar="NAME",
         help=f"the scene's frame (default {SCENE_FRAME})",
     )
-    faults = p.add_argument_group("faults")
-    faults.add_argument(
-        "--contrast-db", type=float, default=15.0, metavar="DB", help="seabed over shadow level (default 15)"
-    )
-    faults.add_argument(
-        "--track-wobble-m",
-        type=float,
-        default=0.0,
-        metavar="M",
-        help="rms departure from the circle, reported",
-    )
-    faults.add_argument(
-        "--height-error",
-        type=float,
-        default=0.0,
-        metavar="F",
-        help="the track reports heights (1 + F) times true",
-    )
-    faults.add_argument(
+
+
+def _fault_options(group: argparse._ArgumentGroup) -> None:
+    """Add what is wrong with the run."""
+    from ..simulation import Faults
+
+    _field_options(group, Faults, "contrast_db", "track_wobble_m", "height_error")
+    group.add_argument(
         "--missing-arc",
         type=float,
         nargs=2,
         action="append",
-        default=[],
         metavar=("START", "STOP"),
+        dest="faults.missing_arcs_deg",
         help="arc without imagery and poses, degrees counter-clockwise; may be repeated",
     )
-    faults.add_argument(
-        "--phase-error-rad", type=float, default=0.0, metavar="RAD", help="rms residual phase error"
+    _field_options(
+        group,
+        Faults,
+        "phase_error_rad",
+        "quadratic_phase_rad",
+        "quadratic_arc_deg",
+        "wrong_sign",
+        "sound_speed_error",
+        "seabed_slope_db",
     )
-    faults.add_argument(
-        "--quadratic-phase-rad",
-        type=float,
-        default=0.0,
-        metavar="RAD",
-        help="parabolic phase error of each arc",
+
+
+def _profile_options(group: argparse._ArgumentGroup) -> None:
+    """Add fields of the profile; what they are by default is the profile's to say."""
+    from ..simulation import Profile
+
+    _field_options(
+        group,
+        Profile,
+        "rows",
+        "cols",
+        "spacing_m",
+        "radius_m",
+        "height_m",
+        "centre_frequency_hz",
+        "bandwidth_hz",
+        "sound_speed_mps",
+        defaults=False,
     )
-    faults.add_argument(
-        "--quadratic-arc-deg",
-        type=float,
-        default=12.0,
-        metavar="DEG",
-        help="length of those arcs (default 12)",
-    )
-    faults.add_argument("--wrong-sign", action="store_true", help="the bag states the opposite spectrum sign")
-    faults.add_argument(
-        "--sound-speed-error",
-        type=float,
-        default=0.0,
-        metavar="F",
-        help="the bag states (1 + F) times the true c",
-    )
-    faults.add_argument(
-        "--seabed-slope-db",
-        type=float,
-        default=0.0,
-        metavar="DB",
-        help="seabed level rises so much west to east",
-    )
-    shape = p.add_argument_group("image and circle, instead of the profile's")
-    for flag, kind, unit, text in (
-        ("--rows", int, "N", "rows of the image"),
-        ("--cols", int, "N", "columns of the image"),
-        ("--spacing-m", float, "M", "pixel"),
-        ("--radius-m", float, "M", "radius of the circle"),
-        ("--height-m", float, "M", "height of the sonar over the seabed"),
-        ("--centre-frequency-hz", float, "HZ", "centre frequency"),
-        ("--bandwidth-hz", float, "HZ", "bandwidth"),
-        ("--sound-speed-mps", float, "MS", "sound speed"),
-    ):
-        dest = "profile_" + flag[2:].replace("-", "_")
-        shape.add_argument(flag, type=kind, metavar=unit, default=None, dest=dest, help=text)
-    output_options(p)
+
+
+def _field_options(
+    group: argparse._ArgumentGroup, kind: type[Any], *names: str, defaults: bool = True
+) -> None:
+    """Add an option for each of some fields of a dataclass; `_given_fields` collects what is given."""
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    for name in names:
+        default, meta = fields[name].default, fields[name].metadata
+        # A fault that is off by default need not say so.
+        told = f" (default {default:g})" if defaults and default else ""
+        options: dict[str, Any] = {"default": None, "dest": f"{kind.__name__.lower()}.{name}"}
+        options["help"] = f"{meta['doc']}{told}"
+        if isinstance(default, bool):
+            options["action"] = "store_true"
+        else:
+            number = type(default)
+            unit = meta["unit"] or ("n" if number is int else "f")
+            options |= {"type": number, "metavar": unit.replace("/", "").upper()}
+        group.add_argument("--" + name.replace("_", "-"), **options)
+
+
+def _given_fields(arguments: argparse.Namespace, kind: type[Any]) -> dict[str, Any]:
+    """Return the fields of a dataclass that the command line gives."""
+    prefix = f"{kind.__name__.lower()}."
+    return {
+        name.removeprefix(prefix): value
+        for name, value in vars(arguments).items()
+        if name.startswith(prefix) and value is not None
+    }
 
 
 def _simulate(arguments: argparse.Namespace, console: Console) -> int:
-    from ..simulation import Faults, get_profile, simulate_bag
+    start = time.perf_counter()
+    run = _simulated(arguments, console)
+    _tell_of_lost_shadows(run, console)
+    _tell_what_was_made(run, arguments, time.perf_counter() - start, console)
+    return OK
 
-    overrides = {
-        name.removeprefix("profile_"): value
-        for name, value in vars(arguments).items()
-        if name.startswith("profile_") and value is not None
-    }
-    faults = Faults(
-        contrast_db=arguments.contrast_db,
-        track_wobble_m=arguments.track_wobble_m,
-        height_error=arguments.height_error,
-        missing_arcs_deg=tuple(tuple(arc) for arc in arguments.missing_arc),
-        phase_error_rad=arguments.phase_error_rad,
-        quadratic_phase_rad=arguments.quadratic_phase_rad,
-        quadratic_arc_deg=arguments.quadratic_arc_deg,
-        wrong_sign=arguments.wrong_sign,
-        sound_speed_error=arguments.sound_speed_error,
-        seabed_slope_db=arguments.seabed_slope_db,
-    )
+
+def _simulated(arguments: argparse.Namespace, console: Console) -> SimulatedRun:
+    """Simulate what is asked for, and write its bag."""
+    from ..simulation import Faults, Profile, get_profile, simulate_bag
+
+    faults = Faults(**_given_fields(arguments, Faults))
     datum = PlaceParameters(
         origin_lat_deg=arguments.origin_lat_deg,
         origin_lon_deg=arguments.origin_lon_deg,
         origin_sigma_m=arguments.origin_sigma_m,
     ).datum()
-    start = time.perf_counter()
     with console.bar("simulating") as bar:
-        run = simulate_bag(
+        return simulate_bag(
             arguments.out_bag,
-            get_profile(arguments.profile, **overrides),
+            get_profile(arguments.profile, **_given_fields(arguments, Profile)),
             arguments.target,
             seed=arguments.seed,
             position_m=tuple(arguments.position),
@@ -230,7 +251,10 @@ def _simulate(arguments: argparse.Namespace, console: Console) -> int:
             datum=datum,
             frame=arguments.scene_frame,
         )
-    out = Path(arguments.out_bag)
+
+
+def _tell_of_lost_shadows(run: SimulatedRun, console: Console) -> None:
+    """Say so if shadows end beyond the image: the target's shape cannot come out then."""
     length, width, height = run.truth.dims_m
     grid = run.image.grid
     _, _, radius, sonar_height = run.track.circle
@@ -242,6 +266,15 @@ def _simulate(arguments: argparse.Namespace, console: Console) -> int:
             f"the target's shadows reach {reach:.1f} m from the middle, but the image ends at {side:.1f} m:"
             " its shape will not come out; take a larger profile or a smaller target"
         )
+
+
+def _tell_what_was_made(
+    run: SimulatedRun, arguments: argparse.Namespace, seconds: float, console: Console
+) -> None:
+    """Say what the bag holds."""
+    out = Path(arguments.out_bag)
+    length, width, height = run.truth.dims_m
+    grid = run.image.grid
     document = {
         "bag": str(out.resolve()),
         "truth": [str(out.with_name(f"{out.name}.truth.{kind}").resolve()) for kind in ("stl", "json")],
@@ -253,13 +286,12 @@ def _simulate(arguments: argparse.Namespace, console: Console) -> int:
         "rows": grid.rows,
         "cols": grid.cols,
         "poses": len(run.track),
-        "seconds": time.perf_counter() - start,
+        "seconds": seconds,
     }
     text = (
         f"{out}: {run.truth.name}"
         + (f" {length:.2f} x {width:.2f} x {height:.2f} m" if height else "")
         + f", image {grid.rows} x {grid.cols} of {grid.spacing_m * 1e3:g} mm as {arguments.encoding},"
-        f" {len(run.track)} poses; {document['seconds']:.1f} s"
+        f" {len(run.track)} poses; {seconds:.1f} s"
     )
     console.result(text, document)
-    return OK

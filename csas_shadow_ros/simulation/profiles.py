@@ -35,11 +35,11 @@ class Profile(Parameters):
     centre_m: tuple[float, ...] = bounded(
         (0.0, 0.0), "scene x, y of the middle of the image", low=-1e3, high=1e3, unit="m", length=2
     )
-    radius_m: float = bounded(75.0, "radius R of the circle", low=0.1, high=1e6, unit="m")
-    height_m: float = bounded(18.0, "height h of the sonar over the seabed", low=0.01, high=1e6, unit="m")
-    centre_frequency_hz: float = bounded(120e3, "centre frequency f_c", low=1.0, high=1e12, unit="Hz")
-    bandwidth_hz: float = bounded(40e3, "bandwidth B", low=1.0, high=1e12, unit="Hz")
-    sound_speed_mps: float = bounded(1500.0, "sound speed c", low=1.0, high=3e8, unit="m/s")
+    radius_m: float = bounded(75.0, "radius of the circle", low=0.1, high=1e6, unit="m")
+    height_m: float = bounded(18.0, "height of the sonar over the seabed", low=0.01, high=1e6, unit="m")
+    centre_frequency_hz: float = bounded(120e3, "centre frequency", low=1.0, high=1e12, unit="Hz")
+    bandwidth_hz: float = bounded(40e3, "bandwidth", low=1.0, high=1e12, unit="Hz")
+    sound_speed_mps: float = bounded(1500.0, "sound speed", low=1.0, high=3e8, unit="m/s")
     block_deg: float = bounded(
         0.5, "aspect block with one sonar position; divides 360", low=0.05, high=5.0, unit="deg"
     )
@@ -185,41 +185,47 @@ class Faults:
         If a value is out of bounds.
     """
 
-    contrast_db: float = 15.0
-    track_wobble_m: float = 0.0
-    height_error: float = 0.0
+    contrast_db: float = bounded(15.0, "seabed over shadow level", low=0.1, high=100.0, unit="dB")
+    track_wobble_m: float = bounded(
+        0.0, "rms departure from the circle, reported", low=0.0, high=1e5, unit="m"
+    )
+    height_error: float = bounded(0.0, "the track reports heights (1 + F) times true", low=-0.9, high=10.0)
     missing_arcs_deg: tuple[tuple[float, float], ...] = ()
-    phase_error_rad: float = 0.0
-    quadratic_phase_rad: float = 0.0
-    quadratic_arc_deg: float = 12.0
-    wrong_sign: bool = False
-    sound_speed_error: float = 0.0
-    seabed_slope_db: float = 0.0
-    track_offset_m: tuple[float, float] = (0.0, 0.0)
-    ellipse: float = 0.0
-    ellipse_deg: float = 0.0
-    spiral_m: float = 0.0
-    tilt_deg: float = 0.0
-    tilt_towards_deg: float = 0.0
-    drift_m: tuple[float, float] = (0.0, 0.0)
-    radial_shift_m: float = 0.0
+    phase_error_rad: float = bounded(0.0, "rms residual phase error", low=0.0, high=100.0, unit="rad")
+    quadratic_phase_rad: float = bounded(
+        0.0, "parabolic phase error of each arc", low=-100.0, high=100.0, unit="rad"
+    )
+    quadratic_arc_deg: float = bounded(12.0, "length of those arcs", low=0.5, high=360.0, unit="deg")
+    wrong_sign: bool = bounded(False, "the bag states the opposite spectrum sign")
+    sound_speed_error: float = bounded(0.0, "the bag states (1 + F) times the true c", low=-0.5, high=1.0)
+    seabed_slope_db: float = bounded(
+        0.0, "seabed level rises so much west to east", low=-60.0, high=60.0, unit="dB"
+    )
+    track_offset_m: tuple[float, float] = bounded(
+        (0.0, 0.0), "centre x, y of the circle, reported", low=-1e5, high=1e5, unit="m", length=2
+    )
+    ellipse: float = bounded(0.0, "semi-axes are (1 ± F) times the radius, reported", low=0.0, high=0.5)
+    ellipse_deg: float = bounded(0.0, "direction of the long semi-axis", unit="deg")
+    spiral_m: float = bounded(
+        0.0, "growth of the radius over the circle, reported", low=-1e5, high=1e5, unit="m"
+    )
+    tilt_deg: float = bounded(
+        0.0, "slope of the seabed against the track's level", low=0.0, high=30.0, unit="deg"
+    )
+    tilt_towards_deg: float = bounded(0.0, "direction in which it rises", unit="deg")
+    drift_m: tuple[float, float] = bounded(
+        (0.0, 0.0), "position error x, y that grows along the track", low=-1e5, high=1e5, unit="m", length=2
+    )
+    radial_shift_m: float = bounded(
+        0.0, "every aspect is imaged so much too near", low=-1e3, high=1e3, unit="m"
+    )
 
     def __post_init__(self) -> None:
-        check_range("contrast_db", self.contrast_db, 0.1, 100.0, "dB")
-        check_range("track_wobble_m", self.track_wobble_m, 0.0, 1e5, "m")
-        check_range("height_error", self.height_error, -0.9, 10.0)
-        check_range("phase_error_rad", self.phase_error_rad, 0.0, 100.0, "rad")
-        check_range("quadratic_phase_rad", self.quadratic_phase_rad, -100.0, 100.0, "rad")
-        check_range("quadratic_arc_deg", self.quadratic_arc_deg, 0.5, 360.0, "deg")
-        check_range("sound_speed_error", self.sound_speed_error, -0.5, 1.0)
-        check_range("seabed_slope_db", self.seabed_slope_db, -60.0, 60.0, "dB")
-        check_range("ellipse", self.ellipse, 0.0, 0.5)
-        check_range("spiral_m", self.spiral_m, -1e5, 1e5, "m")
-        check_range("tilt_deg", self.tilt_deg, 0.0, 30.0, "deg")
-        check_range("radial_shift_m", self.radial_shift_m, -1e3, 1e3, "m")
-        for name in ("track_offset_m", "drift_m"):
-            for value in getattr(self, name):
-                check_range(name, value, -1e5, 1e5, "m")
+        for field in dataclasses.fields(self):
+            value, meta = getattr(self, field.name), field.metadata
+            if meta.get("low") is not None:
+                for number in value if meta["length"] else (value,):
+                    check_range(field.name, number, meta["low"], meta["high"], meta["unit"])
         object.__setattr__(self, "missing_arcs_deg", _check_arcs(self.missing_arcs_deg))
 
     @property

@@ -502,18 +502,66 @@ def simulate(
         raise ParameterError(f"seed is {seed!r}; expected a whole number, 0 or more")
     check_range("echo_db", echo_db, -100.0, 100.0, "dB")
     true_acoustics = profile.acoustics(spectrum_sign)
-    if not isinstance(target, Scene):
-        scene = make_scene(target, position_m, heading_deg, seed)
-    elif tuple(position_m) == (0.0, 0.0) and heading_deg == 0.0:
-        scene = target
-    else:
-        raise ParameterError(
-            f"position_m is {position_m} and heading_deg {heading_deg:g}; expected neither with a ready scene"
-        )
+    scene = _placed(target, position_m, heading_deg, seed)
     streams = [np.random.default_rng([seed, i]) for i in range(4)]
     orbit = _Orbit(profile, faults, streams[0], clockwise=clockwise, start_aspect_deg=start_aspect_deg)
+    phase = _phase_error(faults, streams[1], orbit, profile.band_rad_m[1])
+    maker = _block_maker(profile, scene, faults, bed, streams[2], seed=seed, echo_db=echo_db)
+    threads = workers or os.cpu_count() or 1
+    spectrum = _spectrum(maker, orbit, faults, phase, streams[3], threads, progress)
+    pixels = scipy.fft.ifft2(spectrum, norm="forward", overwrite_x=True, workers=threads)
+    if spectrum_sign == -1:
+        np.conjugate(pixels, out=pixels)
+    stamps, positions = _poses(profile, orbit, faults, clockwise, start_aspect_deg)
+    reported = positions * np.array([1.0, 1.0, 1.0 + faults.height_error])
+    made = np.ascontiguousarray(pixels)
+    image = CoherentImage(
+        made, profile.grid, _claimed(profile, faults, spectrum_sign), int(stamps[-1]), frame=frame
+    )
+    truth = Truth(
+        name=scene.name,
+        target=scene.target,
+        decor=scene.decor,
+        dims_m=scene.dims_m,
+        position_m=scene.position_m,
+        heading_rad=scene.heading_rad,
+        seed=int(seed),
+        profile=profile,
+        faults=faults,
+        acoustics=true_acoustics,
+        sonar_m=orbit.over_seabed(positions),
+    )
+    return SimulatedRun(image, Track(stamps, reported, frame=frame), truth)
+
+
+def _placed(
+    target: str | Path | trimesh.Trimesh | Scene,
+    position_m: tuple[float, float],
+    heading_deg: float,
+    seed: int,
+) -> Scene:
+    """Return the scene of a target put somewhere; a scene stands as it is."""
+    if not isinstance(target, Scene):
+        return make_scene(target, position_m, heading_deg, seed)
+    if tuple(position_m) == (0.0, 0.0) and heading_deg == 0.0:
+        return target
+    raise ParameterError(
+        f"position_m is {position_m} and heading_deg {heading_deg:g}; expected neither with a ready scene"
+    )
+
+
+def _block_maker(
+    profile: Profile,
+    scene: Scene,
+    faults: Faults,
+    bed: Seabed | None,
+    rng: np.random.Generator,
+    *,
+    seed: int,
+    echo_db: float,
+) -> _BlockMaker:
+    """Return what makes the spectrum of a scene on its seabed, the reflectivity drawn from `rng`."""
     k_low, k_centre, k_high = profile.band_rad_m
-    phase = _phase_error(faults, streams[1], orbit, k_centre)
     model = SceneModel(
         scene,
         seed=seed,
@@ -524,27 +572,36 @@ def simulate(
         cell_m=(TWO_PI / (k_high - k_low), TWO_PI / (k_centre * math.radians(12.0))),
     )
     wedges = Wedges.of(profile)
-    seabed = _white(streams[2], (profile.rows, profile.cols))
+    seabed = _white(rng, (profile.rows, profile.cols))
     bed_model = None if bed is None or bed.is_plain else SeabedModel(bed, profile.grid)
-    maker = _BlockMaker(
+    return _BlockMaker(
         profile, wedges, model, seabed, faults.seabed_slope_db, faults.missing_arcs_deg, bed_model
     )
 
+
+def _spectrum(
+    maker: _BlockMaker,
+    orbit: _Orbit,
+    faults: Faults,
+    phase: Callable[[Any], Any] | None,
+    rng: np.random.Generator,
+    threads: int,
+    progress: ProgressOption,
+) -> NDArray[np.complex64]:
+    """Return the image's spectrum: each block as its sonar sees it, with phase error and noise."""
+    profile, wedges = maker.profile, maker.wedges
     # |I| is Rayleigh with mode 1 where E|I|² = 2; noise and seabed share that so that seabed with noise
     # over noise alone is the contrast.
     n = len(wedges.q)
     noise_share = 10.0 ** (-faults.contrast_db / 10.0)
     seabed_scale = np.float32(math.sqrt(2.0 / n * (1.0 - noise_share)))
-    noise_scale = np.float32(math.sqrt(2.0 / n * noise_share))
-    noise = _white(streams[3], (n,))
-    noise *= noise_scale
+    noise = _white(rng, (n,))
+    noise *= np.float32(math.sqrt(2.0 / n * noise_share))
 
-    spectrum = np.zeros((profile.rows, profile.cols), dtype=np.complex64)
-    blocks = len(wedges)
+    blocks, k_centre = len(wedges), profile.band_rad_m[1]
     aspects = (np.arange(blocks) + 0.5) * (TWO_PI / blocks)
     sonar = orbit.over_seabed(orbit.at(aspects.astype(np.float64)))
-
-    threads = workers or os.cpu_count() or 1
+    spectrum = np.zeros((profile.rows, profile.cols), dtype=np.complex64)
 
     def work(block: int) -> None:
         made = maker.make(block, sonar[block], float(aspects[block]))
@@ -561,33 +618,17 @@ def simulate(
     with progress_bar(progress, "blocks") as bar, ThreadPoolExecutor(max_workers=threads) as pool:
         for done, _ in enumerate(pool.map(work, range(blocks)), start=1):
             bar(done, blocks)
-    pixels = scipy.fft.ifft2(spectrum, norm="forward", overwrite_x=True, workers=threads)
-    if spectrum_sign == -1:
-        np.conjugate(pixels, out=pixels)
-    stamps, positions = _poses(profile, orbit, faults, clockwise, start_aspect_deg)
-    reported = positions * np.array([1.0, 1.0, 1.0 + faults.height_error])
-    claimed = Acoustics(
+    return spectrum
+
+
+def _claimed(profile: Profile, faults: Faults, spectrum_sign: int) -> Acoustics:
+    """Return the band and sign that the image states, true or not."""
+    return Acoustics(
         profile.centre_frequency_hz,
         profile.bandwidth_hz,
         profile.sound_speed_mps * (1.0 + faults.sound_speed_error),
         -spectrum_sign if faults.wrong_sign else spectrum_sign,
     )
-    made = np.ascontiguousarray(pixels)
-    image = CoherentImage(made, profile.grid, claimed, int(stamps[-1]), frame=frame)
-    truth = Truth(
-        name=scene.name,
-        target=scene.target,
-        decor=scene.decor,
-        dims_m=scene.dims_m,
-        position_m=scene.position_m,
-        heading_rad=scene.heading_rad,
-        seed=int(seed),
-        profile=profile,
-        faults=faults,
-        acoustics=true_acoustics,
-        sonar_m=orbit.over_seabed(positions),
-    )
-    return SimulatedRun(image, Track(stamps, reported, frame=frame), truth)
 
 
 def _poses(
