@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -261,13 +261,39 @@ def _point(warp: Any, crs: Any, datum: Datum, x: float, y: float) -> tuple[float
     return float(east), float(north)
 
 
-def _sicd(path: Path, datum: Datum | None) -> FoundImage:
-    """Read a SICD on the ground plane; without a datum its reference point is the scene's origin."""
+@dataclass(frozen=True, eq=False)
+class _Sicd:
+    """What is read of a SICD file.
+
+    Parameters
+    ----------
+    pixels : ndarray of complex
+        As they are stored.
+    plane : str
+        What the image lies in.
+    steps_m : (float, float)
+        Pixel spacing down and across.
+    axes_earth : (ndarray, ndarray)
+        Where rows and columns lead, earth-centred unit vectors.
+    point_lla : (float, float, float)
+        Latitude, longitude (deg) and height of the reference point.
+    point_px : ndarray, shape (2,)
+        Row and column of that point, counted from the first ones that are stored.
+    """
+
+    pixels: NDArray[Any]
+    plane: str
+    steps_m: tuple[float, float]
+    axes_earth: tuple[NDArray[Any], NDArray[Any]]
+    point_lla: tuple[float, float, float]
+    point_px: NDArray[Any]
+
+
+def _read_sicd(path: Path) -> _Sicd:
     sicd = need("sarkit.sicd", "import from SICD", "import")
     try:
         with path.open("rb") as file, sicd.NitfReader(file) as reader:
-            tree = reader.metadata.xmltree
-            helper = sicd.XmlHelper(tree)
+            helper = sicd.XmlHelper(reader.metadata.xmltree)
             pixels = reader.read_image()
 
             def load(name: str) -> Any:
@@ -278,55 +304,83 @@ def _sicd(path: Path, datum: Datum | None) -> FoundImage:
                     )
                 return value
 
+            def of_axes(name: str) -> tuple[Any, Any]:
+                down, across = (load(name.format(axis)) for axis in ("Row", "Col"))
+                return down, across
+
             plane = load("Grid/{*}ImagePlane")
-            steps = [float(load(f"Grid/{{*}}{axis}/{{*}}SS")) for axis in ("Row", "Col")]
-            axes = [np.asarray(load(f"Grid/{{*}}{axis}/{{*}}UVectECF"), float) for axis in ("Row", "Col")]
+            steps = of_axes("Grid/{{*}}{}/{{*}}SS")
+            axes = of_axes("Grid/{{*}}{}/{{*}}UVectECF")
             latitude, longitude, altitude = map(float, load("GeoData/{*}SCP/{*}LLH"))
-            middle = np.asarray(load("ImageData/{*}SCPPixel"), float)
-            first = np.array([float(load(f"ImageData/{{*}}First{axis}")) for axis in ("Row", "Col")])
+            point = np.asarray(load("ImageData/{*}SCPPixel"), float)
+            first = np.asarray(of_axes("ImageData/{{*}}First{}"), float)
+            return _Sicd(
+                pixels,
+                plane,
+                (float(steps[0]), float(steps[1])),
+                (np.asarray(axes[0], float), np.asarray(axes[1], float)),
+                (latitude, longitude, altitude),
+                point - first,
+            )
     except ImportSettingsError:
         raise
     except Exception as error:  # sarkit lets through whatever its parsers meet
         raise _unreadable(path, error, "a SICD NITF") from error
-    if plane != "GROUND":
-        raise ImportSettingsError(f"{path} has its image in the {plane} plane; expected the GROUND plane")
-    if not math.isclose(*steps, rel_tol=1e-6):
-        raise ImportSettingsError(
-            f"{path} has pixels of {steps[0]:g} m by {steps[1]:g} m; expected square ones"
-        )
-    datum = datum or Datum(latitude, longitude, altitude_m=altitude)
-    x, y = datum.to_scene(latitude, longitude)
-    rotation, _ = datum.scene_to_earth
-    down, across = (np.asarray(rotation.T @ axis) for axis in axes)  # of rows and columns, east north up
-    directions = {"south": (0, -1, 0), "north": (0, 1, 0), "east": (1, 0, 0), "west": (-1, 0, 0)}
+
+
+#: Directions in a scene, east north up.
+_DIRECTIONS = {"south": (0, -1, 0), "north": (0, 1, 0), "east": (1, 0, 0), "west": (-1, 0, 0)}
+#: Where rows and columns of a stored image lead; what turns it north up; whether a place along either axis of
+#: the stored image is counted from its first (1) or its last pixel (-1) then.
+_TURNS_OF_AXES: dict[tuple[str, str], tuple[Callable[[NDArray[Any]], NDArray[Any]], tuple[int, int]]] = {
+    ("south", "east"): (lambda a: a, (1, 1)),
+    ("south", "west"): (lambda a: a[:, ::-1], (1, -1)),
+    ("north", "east"): (lambda a: a[::-1], (-1, 1)),
+    ("north", "west"): (lambda a: a[::-1, ::-1], (-1, -1)),
+    ("east", "south"): (lambda a: a.T, (1, 1)),
+    ("east", "north"): (lambda a: a.T[::-1], (1, -1)),
+    ("west", "south"): (lambda a: a.T[:, ::-1], (-1, 1)),
+    ("west", "north"): (lambda a: a.T[::-1, ::-1], (-1, -1)),
+}
+
+
+def _directions_of(axes: Sequence[NDArray[Any]], path: Path) -> tuple[str, str]:
+    """Return which way rows and columns lead; refuse an image that is turned against north."""
     lies = [
-        next((n for n, to in directions.items() if np.abs(axis - to).max() < _MOST_OFF_AXIS), None)
-        for axis in (down, across)
+        next((n for n, to in _DIRECTIONS.items() if np.abs(axis - to).max() < _MOST_OFF_AXIS), "")
+        for axis in axes
     ]
-    turned = {
-        ("south", "east"): (lambda a: a, (1, 1)),
-        ("south", "west"): (lambda a: a[:, ::-1], (1, -1)),
-        ("north", "east"): (lambda a: a[::-1], (-1, 1)),
-        ("north", "west"): (lambda a: a[::-1, ::-1], (-1, -1)),
-        ("east", "south"): (lambda a: a.T, (1, 1)),
-        ("east", "north"): (lambda a: a.T[::-1], (1, -1)),
-        ("west", "south"): (lambda a: a.T[:, ::-1], (-1, 1)),
-        ("west", "north"): (lambda a: a.T[::-1, ::-1], (-1, -1)),
-    }.get((str(lies[0]), str(lies[1])))
-    if turned is None:
-        told = [axis.round(4).tolist() for axis in (down, across)]
+    if (lies[0], lies[1]) not in _TURNS_OF_AXES:
+        told = [axis.round(4).tolist() for axis in axes]
         raise ImportSettingsError(
             f"{path}: rows lead to {told[0]}, columns to {told[1]} (east, north, up); expected one along east"
             " or west, the other along north or south"
         )
-    turn, signs = turned
-    # Of the reference point, counted from the first row and column of what is stored, as the array lies now.
+    return lies[0], lies[1]
+
+
+def _sicd(path: Path, datum: Datum | None) -> FoundImage:
+    """Read a SICD on the ground plane; without a datum its reference point is the scene's origin."""
+    found = _read_sicd(path)
+    if found.plane != "GROUND":
+        raise ImportSettingsError(
+            f"{path} has its image in the {found.plane} plane; expected the GROUND plane"
+        )
+    step, other = found.steps_m
+    if not math.isclose(step, other, rel_tol=1e-6):
+        raise ImportSettingsError(f"{path} has pixels of {step:g} m by {other:g} m; expected square ones")
+    latitude, longitude, altitude = found.point_lla
+    datum = datum or Datum(latitude, longitude, altitude_m=altitude)
+    x, y = datum.to_scene(latitude, longitude)
+    rotation, _ = datum.scene_to_earth
+    lies = _directions_of([np.asarray(rotation.T @ axis) for axis in found.axes_earth], path)
+    turn, signs = _TURNS_OF_AXES[lies]
     at = [
-        k if sign > 0 else n - 1 - k for k, n, sign in zip(middle - first, pixels.shape, signs, strict=True)
+        k if sign > 0 else n - 1 - k
+        for k, n, sign in zip(found.point_px, found.pixels.shape, signs, strict=True)
     ]
     col, row = (at[1], at[0]) if lies[0] in ("south", "north") else (at[0], at[1])
-    array = np.ascontiguousarray(turn(pixels)).astype(np.complex64, copy=False)  # type: ignore[no-untyped-call]
+    array = np.ascontiguousarray(turn(found.pixels)).astype(np.complex64, copy=False)
     rows, cols = array.shape
-    step = steps[0]
     grid = GroundGrid(rows, cols, step, x - col * step, y + row * step)
     return FoundImage(array, grid, datum)
