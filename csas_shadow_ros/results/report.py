@@ -297,6 +297,44 @@ def _sign(result: Result, context: Context) -> dict[str, Any]:
     }
 
 
+def _quality(result: Result) -> dict[str, Any]:
+    """Say how far the result can be trusted, and why no farther."""
+    return {
+        "verdict": result.quality.verdict,
+        "reasons": list(result.quality.reasons),
+        "explained": explained_share(result),
+    }
+
+
+def _views(result: Result, context: Context) -> dict[str, Any]:
+    """Count the views: those that came, and what became of them."""
+    used, rejected = result.views_used, len(result.rejected)
+    composed = len(result.composites.stamps) if result.composites is not None else 0
+    return {
+        "in": max(used + rejected, composed) if context.views_in is None else context.views_in,
+        "used": used,
+        "rejected": rejected,
+        "lost": context.views_lost,
+        "reasons": _reasons(result.rejected.values()),
+        "rejected_by_aspect_deg": {f"{a:g}": r for a, r in sorted(result.rejected.items())},
+    }
+
+
+def _how_it_was_made(context: Context, part: Callable[..., Any]) -> dict[str, Any]:
+    """Say from what the result was made, and by which parameters and programs."""
+    return {
+        "stage": context.stage,
+        "through": "one process" if context.nodes is None else "node graph",
+        "nodes": context.nodes,
+        "input": part("input", lambda: context.input, {}),
+        "problems": list(context.problems),
+        "parameters": dataclasses.asdict(context.parameters),
+        "command": list(context.command),
+        "versions": part("versions", versions, {"csas_shadow_ros": __version__}),
+        "platform": platform.platform(),
+    }
+
+
 def build_report(
     result: Result,
     context: Context,
@@ -322,9 +360,6 @@ def build_report(
         Makes a part: its name, what makes it, and what stands there if that fails
         (`ResultsWriter.attempt`).
     """
-    used, lost = result.views_used, len(result.rejected)
-    found = result.mesh is not None
-    composed = len(result.composites.stamps) if result.composites is not None else 0
 
     def part(name: str, make: Callable[[], Any], otherwise: Any = None) -> Any:
         return attempt(f"report: {name}", lambda: json_ready(make()), otherwise)
@@ -333,13 +368,9 @@ def build_report(
     no_sign = {"stated": None, "verdict": "not checked", "why": "it cannot be told", "override": None}
     report = {
         "format": FORMAT,
-        "object": found,
+        "object": result.mesh is not None,
         "verdict": result.verdict,
-        "quality": {
-            "verdict": result.quality.verdict,
-            "reasons": list(result.quality.reasons),
-            "explained": explained_share(result),
-        },
+        "quality": _quality(result),
         "why_no_object": part("why_no_object", lambda: None if result.objects else no_object_reason(result)),
         "run": result.run_ns,
         "arc_deg": math.degrees(result.arc_rad),
@@ -362,26 +393,11 @@ def build_report(
             {"grid": None, "dimensions": None},
         ),
         "truth": part("truth", lambda: _truth(context.truth, truths)),
-        "views": {
-            "in": max(used + lost, composed) if context.views_in is None else context.views_in,
-            "used": used,
-            "rejected": lost,
-            "lost": context.views_lost,
-            "reasons": _reasons(result.rejected.values()),
-            "rejected_by_aspect_deg": {f"{a:g}": r for a, r in sorted(result.rejected.items())},
-        },
+        "views": _views(result, context),
         "levels": part("levels", lambda: _levels(result.evidence), no_levels),
         "spectrum_sign": part("spectrum_sign", lambda: _sign(result, context), no_sign),
         "timings_s": {**result.timings_s, **context.timings_s},
-        "stage": context.stage,
-        "through": "one process" if context.nodes is None else "node graph",
-        "nodes": context.nodes,
-        "input": part("input", lambda: context.input, {}),
-        "problems": list(context.problems),
-        "parameters": dataclasses.asdict(context.parameters),
-        "command": list(context.command),
-        "versions": part("versions", versions, {"csas_shadow_ros": __version__}),
-        "platform": platform.platform(),
+        **_how_it_was_made(context, part),
         "files": [],
         "figures_left_out": dict(figures_left_out),
         "failed": {},
@@ -524,65 +540,100 @@ def _object_lines(report: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def _title(report: Mapping[str, Any]) -> str:
+    """Write the first line: what was found, and whether that is so."""
+    line = f"csas-shadow {report['versions']['csas_shadow_ros']}: {headline(report)}"
+    truth, found = report["truth"], bool(report["dimensions"])
+    if not truth or found == truth["object"]:
+        return f"{line} (as is true)" if truth and not found else line
+    return f"{line} (in truth there is {'one' if truth['object'] else 'none'})"
+
+
+def _place_lines(report: Mapping[str, Any]) -> list[str]:
+    """Write where on earth each object lies."""
+    lines = []
+    # Reports of before this entry have none.
+    for entry in report.get("objects", []):
+        if entry.get("place"):
+            place = Place(**{k: math.nan if v is None else v for k, v in entry["place"].items()})
+            name = f"object {entry['number']}" if len(report["objects"]) > 1 else "place"
+            lines.append(f"{name}: {place}, true bearing of its length {place.bearing_deg:.1f}°")
+    return lines
+
+
+def _score_lines(truth: Mapping[str, Any]) -> list[str]:
+    """Write how well the grid agrees with the truth."""
+    s = truth.get("scores")
+    if not s:
+        return []
+    return [
+        f"IoU against the truth {s['iou_truth']:.3f}, against its shadow hull {s['iou_hull']:.3f}"
+        f" (the hull itself: {s['iou_hull_truth']:.3f})"
+    ]
+
+
+def _carving_lines(report: Mapping[str, Any]) -> list[str]:
+    """Write what was carved, what of it is empty, and over what seabed."""
+    lines = []
+    hollows, slope, grid = report.get("hollows"), report.get("seabed_slope"), report["grid"]
+    if hollows and hollows["voxels"]:
+        line = f"hollows that no shadow shows, but echoes do: {hollows['volume_m3']:.4f} m³"
+        if iou_truth := hollows["iou_truth"]:
+            line += f"; without them, IoU against the truth {iou_truth['matter']:.3f}"
+        lines.append(line)
+    if slope and slope["believed"]:
+        lines.append(
+            f"the seabed slopes by {slope['slope_deg']:.1f}° ± {slope['sigma_deg']:.1f}° against the track's"
+            f" level, up towards {slope['uphill_deg']:.0f}°: the sonar's heights were corrected"
+        )
+    if grid:
+        threshold = "none" if grid["threshold"] is None else f"{grid['threshold']:.4f}"
+        lines.append(f"{grid['method']} carving, voxels of {grid['voxel_size_m']:g} m, threshold {threshold}")
+    return lines
+
+
+def _view_lines(views: Mapping[str, Any]) -> list[str]:
+    """Write how many views there were, and why some were not used."""
+    return [
+        f"views: {views['in']} in, {views['used']} in the grid, {views['rejected']} not used,"
+        f" {views['lost']} lost",
+        *(
+            f"  {n} not used{', the first' if n > 1 else ''}: {reason}"
+            for reason, n in views["reasons"].items()
+        ),
+    ]
+
+
+def _sign_lines(sign: Mapping[str, Any]) -> list[str]:
+    """Write what the check of the spectrum's sign says, and whether the sign was overridden."""
+    checked = "" if sign["verdict"] != "not checked" else "not checked, "
+    lines = [f"spectrum sign: {checked}{sign['why']}"]
+    if sign["override"] is not None:
+        lines.append(f"spectrum sign was overridden to {sign['override']:+d} on the command line")
+    return lines
+
+
 def summary(report: Mapping[str, Any]) -> str:
     """Write the short table that is printed and kept as ``summary.txt``."""
     truth = report["truth"] or {}
     true = truth.get("dimensions") or {}
     mine = report["dimensions"] or {}
     quality = report.get("quality") or {"verdict": "good", "reasons": []}
-    lines = [f"csas-shadow {report['versions']['csas_shadow_ros']}: {headline(report)}", ""]
-    if truth and not mine and not truth["object"]:
-        lines[0] += " (as is true)"
-    elif truth and bool(mine) != truth["object"]:
-        lines[0] += " (in truth there is one)" if truth["object"] else " (in truth there is none)"
-    if mine or true:
-        lines += [*_size_lines(mine, true), ""]
-    # Reports of before these entries have none.
-    for entry in report.get("objects", []):
-        if entry.get("place"):
-            place = Place(**{k: math.nan if v is None else v for k, v in entry["place"].items()})
-            name = f"object {entry['number']}" if len(report["objects"]) > 1 else "place"
-            lines.append(f"{name}: {place}, true bearing of its length {place.bearing_deg:.1f}°")
-    if truth.get("scores"):
-        s = truth["scores"]
-        lines.append(
-            f"IoU against the truth {s['iou_truth']:.3f}, against its shadow hull {s['iou_hull']:.3f}"
-            f" (the hull itself: {s['iou_hull_truth']:.3f})"
-        )
-    lines += [f"{quality['verdict']}: {reason}" for reason in quality["reasons"]]
-    hollows = report.get("hollows")
-    if hollows and hollows["voxels"]:
-        line = f"hollows that no shadow shows, but echoes do: {hollows['volume_m3']:.4f} m³"
-        if iou_truth := hollows["iou_truth"]:
-            line += f"; without them, IoU against the truth {iou_truth['matter']:.3f}"
-        lines.append(line)
-    slope = report.get("seabed_slope")
-    if slope and slope["believed"]:
-        lines.append(
-            f"the seabed slopes by {slope['slope_deg']:.1f}° ± {slope['sigma_deg']:.1f}° against the track's"
-            f" level, up towards {slope['uphill_deg']:.0f}°: the sonar's heights were corrected"
-        )
-    grid, views = report["grid"], report["views"]
-    if grid:
-        threshold = "none" if grid["threshold"] is None else f"{grid['threshold']:.4f}"
-        lines.append(f"{grid['method']} carving, voxels of {grid['voxel_size_m']:g} m, threshold {threshold}")
-    lines += _object_lines(report)
-    lines.append(
-        f"views: {views['in']} in, {views['used']} in the grid, {views['rejected']} not used,"
-        f" {views['lost']} lost"
-    )
-    lines += [
-        f"  {n} not used{', the first' if n > 1 else ''}: {reason}" for reason, n in views["reasons"].items()
-    ]
-    sign = report["spectrum_sign"]
-    lines.append(
-        f"spectrum sign: {sign['why'] if sign['verdict'] != 'not checked' else 'not checked, ' + sign['why']}"
-    )
-    if sign["override"] is not None:
-        lines.append(f"spectrum sign was overridden to {sign['override']:+d} on the command line")
-    lines += [f"problem with the input: {problem}" for problem in report["problems"]]
-    lines += [f"truth: {note}" for note in truth.get("notes", ())]
-    lines += [f"failed: {part}: {why}" for part, why in report.get("failed", {}).items()]
     total = sum(v for v in report["timings_s"].values() if v is not None)
-    lines.append(f"time: {total:.1f} s")
+    lines = [
+        _title(report),
+        "",
+        *([*_size_lines(mine, true), ""] if mine or true else []),
+        *_place_lines(report),
+        *_score_lines(truth),
+        *(f"{quality['verdict']}: {reason}" for reason in quality["reasons"]),
+        *_carving_lines(report),
+        *_object_lines(report),
+        *_view_lines(report["views"]),
+        *_sign_lines(report["spectrum_sign"]),
+        *(f"problem with the input: {problem}" for problem in report["problems"]),
+        *(f"truth: {note}" for note in truth.get("notes", ())),
+        *(f"failed: {part}: {why}" for part, why in report.get("failed", {}).items()),
+        f"time: {total:.1f} s",
+    ]
     return "\n".join(lines) + "\n"
