@@ -8,7 +8,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,6 +31,9 @@ from .from_bag import (
     tell_of_sectors,
 )
 from .results import Context, ResultsWriter
+
+if TYPE_CHECKING:
+    from .graph.replay import ReplayResult
 
 
 def process_bag(
@@ -185,15 +188,9 @@ def replay_bag(
     CsasError
         As `process_bag`; and if ROS 2 is not there, or the graph does not get to its end.
     """
-    from .results.recording import adopt_replay, node_table, unplaced
+    from .results.recording import adopt_replay
 
-    try:
-        import rclpy  # noqa: F401  (asked for here, to say so in one line)
-    except ImportError as error:
-        raise CsasError(
-            f"replay needs ROS 2, which is not there ({error}); source it, or pip install"
-            " 'csas_shadow_ros[ros]', or use `csas-shadow run`"
-        ) from error
+    _require_ros()
     from .graph.replay import replay
 
     p = parameters or PipelineParameters()
@@ -204,14 +201,7 @@ def replay_bag(
         run = read_run(bag, namespace, run_of_bag)
         context = Context(p, command)
         context.read_truth(bag)
-        image = None
-        stage = start_from
-        if choose_start(run, start_from) == "image":
-            image = run.coherent_image()
-            refuse_contradictions(image, run.require_track(), notice, run)
-            if run.image is None:
-                stage = "sector"  # also where there is an image that cannot be used
-                tell_of_sectors(run, notice)
+        image, stage = _image_to_play(run, start_from, notice)
         context.timings_s["read"] = time.perf_counter() - began
         scratch = writer.work / ".replay"
         replayed = replay(
@@ -224,31 +214,69 @@ def replay_bag(
             domain_id=domain_id,
             record=True,
             max_objects=max_objects,
-            overrides={
-                # The results folder that takes the recording is written out to the disk as a whole.
-                "bag_recorder": {"compression": "lz4", "sync": False},
-                "bag_player": {} if run.run_ns is None else {"run": run.run_ns},
-            },
+            overrides=_of_player_and_recorder(run),
             progress=progress or False,
             notice=notice,
-            beside=None
-            if viewer_port is None
-            else {"viewer": {"port": viewer_port, "method": p.carving.method}},
+            beside=None if viewer_port is None else _viewer(viewer_port, p),
         )
-        context.stage = "image" if replayed.stage == "sector" else replayed.stage
-        if context.stage == "image":
-            context.image = image
-        context.track = run.track
-        context.nodes, context.views_lost = node_table(replayed), replayed.lost
-        context.views_in = replayed.views_total
+        _take_replay(context, replayed, run, image)
         result = adopt_replay(writer, replayed, p, whole=rate == 0.0)
         writer.attempt("log", lambda: (scratch / "log").rename(writer.work / "log"), None)
         shutil.rmtree(scratch, ignore_errors=True)
-        context.problems = [*told_once(run.problems), *unplaced(replayed)]
-        context.problems += [f"the recording is not whole: {line}" for line in replayed.not_recorded]
         context.describe(lambda: describe_run(run))
         report = writer.finish(result, context)
         return report | {"not_recorded": replayed.not_recorded} if write_bag else report
+
+
+def _require_ros() -> None:
+    """Say in one line where ROS 2 is not there."""
+    try:
+        import rclpy  # noqa: F401
+    except ImportError as error:
+        raise CsasError(
+            f"replay needs ROS 2, which is not there ({error}); source it, or pip install"
+            " 'csas_shadow_ros[ros]', or use `csas-shadow run`"
+        ) from error
+
+
+def _image_to_play(run: Run, start_from: str, notice: Notice) -> tuple[CoherentImage | None, str]:
+    """Return the image that the graph is to make views of, None where it starts from views; and the stage."""
+    if choose_start(run, start_from) != "image":
+        return None, start_from
+    image = run.coherent_image()
+    refuse_contradictions(image, run.require_track(), notice, run)
+    if run.image is not None:
+        return image, start_from
+    tell_of_sectors(run, notice)
+    return image, "sector"  # also where there is an image that cannot be used
+
+
+def _of_player_and_recorder(run: Run) -> dict[str, dict[str, Any]]:
+    """Return the parameters of the nodes that play the run and record the graph."""
+    return {
+        # The results folder that takes the recording is written out to the disk as a whole.
+        "bag_recorder": {"compression": "lz4", "sync": False},
+        "bag_player": {} if run.run_ns is None else {"run": run.run_ns},
+    }
+
+
+def _viewer(port: int, parameters: PipelineParameters) -> dict[str, dict[str, Any]]:
+    """Return the node that shows the graph, with its parameters."""
+    return {"viewer": {"port": port, "method": parameters.carving.method}}
+
+
+def _take_replay(context: Context, replayed: ReplayResult, run: Run, image: CoherentImage | None) -> None:
+    """Put into the context what the graph says of its run, besides the result."""
+    from .results.recording import node_table, unplaced
+
+    context.stage = "image" if replayed.stage == "sector" else replayed.stage
+    if context.stage == "image":
+        context.image = image
+    context.track = run.track
+    context.nodes, context.views_lost = node_table(replayed), replayed.lost
+    context.views_in = replayed.views_total
+    context.problems = [*told_once(run.problems), *unplaced(replayed)]
+    context.problems += [f"the recording is not whole: {line}" for line in replayed.not_recorded]
 
 
 def told_once(problems: Sequence[Problem]) -> list[str]:

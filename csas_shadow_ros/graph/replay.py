@@ -449,16 +449,7 @@ def replay(
     tell = notice or (lambda _: None)
     began = time.monotonic()
     with contextlib.ExitStack() as stack:
-        if out_dir is None:
-            out = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="csas_replay_")))
-        else:
-            out = Path(out_dir)
-            try:
-                out.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise ParameterError(
-                    f"out_dir is {str(out)!r} ({error.strerror}); expected a folder that can be written to"
-                ) from None
+        out = stack.enter_context(_folder(out_dir))
         recording = None if record is False else out / "recording" if record is True else Path(record)
         chosen, decision = _plan(bag, stage, p, namespace)
         of_stage = node_parameters(p, None if decision is None else decision.target, max_objects)
@@ -466,13 +457,7 @@ def replay(
         plan["bag_player"]["bag_namespace"] = namespace or ""
         plan |= {name: dict(own) for name, own in (beside or {}).items()}
         check(plan)
-        domain = stack.enter_context(DomainReservation(domain_id))
-        graph_id = new_graph_id()
-        server = stack.enter_context(start_fork_server(domain, out / "log", graph_id))
-        graph = stack.enter_context(Graph(plan, domain, out / "log", max_restarts, server, graph_id))
-        with signals_deferred():
-            watcher = _Watcher(graph, domain)
-            stack.callback(watcher.close)
+        graph, watcher = stack.enter_context(_running(plan, domain_id, out / "log", max_restarts))
         done = stack.enter_context(_shown(progress))
         _until_complete(graph, watcher, chosen, done, tell, stall_timeout_s)
         through = time.monotonic()
@@ -486,13 +471,41 @@ def replay(
         result.recording = recording
         result.seconds = time.monotonic() - began
         if recording is not None:
-            published = watcher.published(_STAGES_BEFORE)
-            unable = watcher.unable("bag_recorder")
-            graph.stop()  # its bag is finished now
-            result.not_recorded = [unable] if unable else []
-            topics = graph.parameters["bag_recorder"].get("topics", "all")
-            result.not_recorded += _not_recorded(recording, topics, result, published, set(messages))
+            result.not_recorded = _finish_recording(recording, graph, watcher, result, set(messages))
     return result
+
+
+@contextlib.contextmanager
+def _folder(out_dir: str | Path | None) -> Iterator[Path]:
+    """Give the folder for logs and recording, made if need be; without one, a temporary one."""
+    if out_dir is None:
+        with tempfile.TemporaryDirectory(prefix="csas_replay_") as made:
+            yield Path(made)
+        return
+    out = Path(out_dir)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ParameterError(
+            f"out_dir is {str(out)!r} ({error.strerror}); expected a folder that can be written to"
+        ) from None
+    yield out
+
+
+@contextlib.contextmanager
+def _running(
+    plan: Mapping[str, Mapping[str, Any]], domain_id: int | None, logs: Path, max_restarts: int
+) -> Iterator[tuple[Graph, _Watcher]]:
+    """Start the nodes of a plan in a domain of their own, and what listens to them; end them afterwards."""
+    graph_id = new_graph_id()
+    with contextlib.ExitStack() as stack:
+        domain = stack.enter_context(DomainReservation(domain_id))
+        server = stack.enter_context(start_fork_server(domain, logs, graph_id))
+        graph = stack.enter_context(Graph(plan, domain, logs, max_restarts, server, graph_id))
+        with signals_deferred():
+            watcher = _Watcher(graph, domain)
+            stack.callback(watcher.close)
+        yield graph, watcher
 
 
 def _plan(
@@ -693,6 +706,18 @@ def _collect(
 def _views_in(watcher: _Watcher, node: str) -> int:
     told = [b.counts.get("views", 0) for (name, _), b in watcher.beats.items() if name == node]
     return max(told, default=0)
+
+
+def _finish_recording(
+    recording: Path, graph: Graph, watcher: _Watcher, result: ReplayResult, messages: set[str]
+) -> list[str]:
+    """End the graph, so that its bag is finished, and say what of the run the bag lacks."""
+    published = watcher.published(_STAGES_BEFORE)
+    unable = watcher.unable("bag_recorder")
+    graph.stop()
+    topics = graph.parameters["bag_recorder"].get("topics", "all")
+    lacking = _not_recorded(recording, topics, result, published, messages)
+    return [unable, *lacking] if unable else lacking
 
 
 def _not_recorded(
