@@ -36,6 +36,8 @@ from .store import Entry, ViewStore
 
 #: A4, inches.
 _PAGE = (8.27, 11.69)
+#: Its margins, shares of its width.
+_LEFT, _RIGHT = 0.07, 0.93
 _STYLE: dict[str, Any] = {"font.size": 8.5, "pdf.fonttype": 42, "axes.linewidth": 0.6}
 #: Triangles are painted in pixels, not as lines: a report is to be sent by a narrow link.
 _DPI = 170
@@ -419,51 +421,69 @@ def as_pdf(sheet: Sheet) -> bytes:
 
 
 def _lay_out(figure: Figure, sheet: Sheet) -> None:
-    left, right = 0.07, 0.93
+    """Put everything in its place, from the top of the page to its foot."""
+    _write_head(figure, sheet)
+    _draw_views(figure, sheet)
+    _draw_shapes(figure, sheet)
+    _dimension_table(figure, sheet, _LEFT)
+    _write(figure, 0.5, 0.335, _wrapped(sheet.facts, 62, 11), linespacing=1.35)
+    _write_judgement(figure, sheet)
+    damage = sheet.damage or ["None is known: no view was lost or rejected."]
+    _write(figure, _LEFT, 0.094, "Damage", fontweight="bold")
+    _write(figure, _LEFT, 0.081, _wrapped(damage, 125, _DAMAGE_LINES))
+    _write(figure, _LEFT, 0.025, sheet.versions, fontsize=7, color="#444444")
 
-    def write(x: float, y: float, text: str, **more: Any) -> None:
-        figure.text(x, y, text, va="top", **more)
 
-    write(left, 0.965, sheet.title[:60], fontsize=17, fontweight="bold")
-    write(left, 0.94, sheet.about, fontsize=9, color="#444444")
-    judgement = (sheet.judgement or "not judged").upper()
-    figure.text(
-        right,
+def _write(figure: Figure, x: float, y: float, text: str, **more: Any) -> None:
+    """Write text below a point of the page (shares of its width and height)."""
+    figure.text(x, y, text, va="top", **more)
+
+
+def _write_head(figure: Figure, sheet: Sheet) -> None:
+    """Write what this is, how it was judged, and how far it can be trusted."""
+    _write(figure, _LEFT, 0.965, sheet.title[:60], fontsize=17, fontweight="bold")
+    _write(figure, _LEFT, 0.94, sheet.about, fontsize=9, color="#444444")
+    _write(
+        figure,
+        _RIGHT,
         0.955,
-        judgement,
+        (sheet.judgement or "not judged").upper(),
         ha="right",
-        va="top",
         fontsize=14,
         fontweight="bold",
         color="white",
         bbox={"facecolor": _COLOURS[sheet.judgement], "edgecolor": "none", "boxstyle": "round,pad=0.4"},
     )
     quality = f"{sheet.verdict}; the result is {sheet.quality}" if sheet.quality else sheet.verdict
-    write(left, 0.92, quality, fontsize=10.5, fontweight="bold", color=_QUALITY.get(sheet.quality, "#222222"))
-    write(left, 0.903, _wrapped(["; ".join(sheet.reasons)], 115, 2), fontsize=8.5)
+    colour = _QUALITY.get(sheet.quality, "#222222")
+    _write(figure, _LEFT, 0.92, quality, fontsize=10.5, fontweight="bold", color=colour)
+    _write(figure, _LEFT, 0.903, _wrapped(["; ".join(sheet.reasons)], 115, 2), fontsize=8.5)
+
+
+def _draw_views(figure: Figure, sheet: Sheet) -> None:
+    """Draw the pictures, side by side, over what they show."""
     width = 0.41
     for i, (title, draw) in enumerate(sheet.pictures):
-        axes = figure.add_axes((left + i * (width + 0.04), 0.575, width, width * _PAGE[0] / _PAGE[1]))
+        axes = figure.add_axes((_LEFT + i * (width + 0.04), 0.575, width, width * _PAGE[0] / _PAGE[1]))
         axes.set_title(title, fontsize=9, loc="left", pad=3)
         draw(axes)
-    write(
-        left,
-        0.568,
-        _LEGEND.replace(". Hue", ".\nHue"),
-        fontsize=7,
-        color="#444444",
-    )
+    _write(figure, _LEFT, 0.568, _LEGEND.replace(". Hue", ".\nHue"), fontsize=7, color="#444444")
+
+
+def _draw_shapes(figure: Figure, sheet: Sheet) -> None:
+    """Draw the carved shape from its sides."""
     for i, (title, draw) in enumerate(sheet.shapes):
-        axes = figure.add_axes((left + 0.015 + i * 0.295, 0.375, 0.25, 0.15))
+        axes = figure.add_axes((_LEFT + 0.015 + i * 0.295, 0.375, 0.25, 0.15))
         axes.set_title(title, fontsize=9, loc="left", pad=3)
         draw(axes)
-    _dimension_table(figure, sheet, left)
-    facts = _wrapped(sheet.facts, 62, 11)
-    write(0.5, 0.335, facts, linespacing=1.35)
+
+
+def _write_judgement(figure: Figure, sheet: Sheet) -> None:
+    """Write the operator's judgement and remark into a box."""
     figure.add_artist(
         FancyBboxPatch(
-            (left, 0.1),
-            right - left,
+            (_LEFT, 0.1),
+            _RIGHT - _LEFT,
             0.108,
             boxstyle="round,pad=0,rounding_size=0.004",
             facecolor="#f3f3f3",
@@ -472,16 +492,9 @@ def _lay_out(figure: Figure, sheet: Sheet) -> None:
             transform=figure.transFigure,
         )
     )
-    write(left + 0.01, 0.203, f"Judgement: {sheet.judged}"[:120], fontweight="bold")
     remark = sheet.remark.splitlines() or ["No remarks."]
-    write(left + 0.01, 0.188, _wrapped(remark, 112, _REMARK_LINES))
-    write(left, 0.094, "Damage", fontweight="bold")
-    write(
-        left,
-        0.081,
-        _wrapped(sheet.damage or ["None is known: no view was lost or rejected."], 125, _DAMAGE_LINES),
-    )
-    write(left, 0.025, sheet.versions, fontsize=7, color="#444444")
+    _write(figure, _LEFT + 0.01, 0.203, f"Judgement: {sheet.judged}"[:120], fontweight="bold")
+    _write(figure, _LEFT + 0.01, 0.188, _wrapped(remark, 112, _REMARK_LINES))
 
 
 def _dimension_table(figure: Figure, sheet: Sheet, left: float) -> None:
