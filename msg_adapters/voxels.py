@@ -125,8 +125,25 @@ def voxels_from_msg(msg: Any, where: str = "voxels") -> Voxels:
     """
     check_type(msg, POINT_CLOUD, where)
     frame_of(msg, where)
-    step, rows, cols = int(msg.point_step), int(msg.height), int(msg.width)
-    order = ">" if msg.is_bigendian else "<"
+    points = _records(msg, _fields(msg, where), where)
+    xyz = np.column_stack([points[c] for c in "xyz"]).astype(np.float32)
+    bad = np.flatnonzero(~np.isfinite(xyz).all(axis=1))
+    if bad.size:
+        raise AdapterError(
+            f"{where} has {bad.size} of {len(points)} points not finite, the first at {bad[0]}"
+            f" ({xyz[bad[0]].tolist()}); expected finite metres"
+        )
+    views = points["views"]
+    return Voxels(
+        stamp_to_ns(msg.header.stamp, f"{where}.header.stamp"),
+        xyz,
+        points["l_out"].astype(np.float32),
+        views.astype(views.dtype.newbyteorder("=")),
+    )
+
+
+def _fields(msg: Any, where: str) -> dict[str, tuple[str, int]]:
+    """Return type and offset of each field of a voxel; refuse a cloud that lacks one."""
     found: dict[str, tuple[str, int]] = {}
     for field in msg.fields:
         if field.name not in _ALLOWED:
@@ -139,15 +156,21 @@ def voxels_from_msg(msg: Any, where: str = "voxels") -> Voxels:
             )
         if int(field.count) > 1:
             raise AdapterError(f"{where}.fields: {field.name} has count {field.count}; expected 1")
-        if int(field.offset) + np.dtype(kind).itemsize > step:
+        end = int(field.offset) + np.dtype(kind).itemsize
+        if end > int(msg.point_step):
             raise AdapterError(
-                f"{where}.fields: {field.name} ends at byte {int(field.offset) + np.dtype(kind).itemsize};"
-                f" expected inside point_step, {step}"
+                f"{where}.fields: {field.name} ends at byte {end};"
+                f" expected inside point_step, {int(msg.point_step)}"
             )
         found[field.name] = (kind, int(field.offset))
     if missing := [name for name in _ALLOWED if name not in found]:
         raise AdapterError(f"{where}.fields lacks {quoted(missing[0])}; expected {', '.join(_ALLOWED)}")
-    row_step = int(msg.row_step)
+    return found
+
+
+def _records(msg: Any, fields: dict[str, tuple[str, int]], where: str) -> NDArray[Any]:
+    """Return a cloud's points as records of those fields; refuse sizes that contradict each other."""
+    step, rows, cols, row_step = int(msg.point_step), int(msg.height), int(msg.width), int(msg.row_step)
     if row_step < step * cols:
         raise AdapterError(
             f"{where}.row_step is {row_step} bytes; expected {step * cols} ({cols} points of {step} bytes)"
@@ -156,30 +179,18 @@ def voxels_from_msg(msg: Any, where: str = "voxels") -> Voxels:
         raise AdapterError(
             f"{where}.data has {len(msg.data)} bytes; expected row_step * height = {row_step * rows}"
         )
+    order = ">" if msg.is_bigendian else "<"
     dtype = np.dtype(
         {
-            "names": list(found),
-            "formats": [order + kind for kind, _ in found.values()],
-            "offsets": [offset for _, offset in found.values()],
+            "names": list(fields),
+            "formats": [order + kind for kind, _ in fields.values()],
+            "offsets": [offset for _, offset in fields.values()],
             "itemsize": step,
         }
     )
-    n = rows * cols
-    raw = np.frombuffer(msg.data, np.uint8) if n else np.empty(0, np.uint8)
+    if not rows * cols:
+        return np.empty(0, dtype)
+    raw = np.frombuffer(msg.data, np.uint8)
     if row_step != step * cols:
         raw = np.ascontiguousarray(raw.reshape(rows, row_step)[:, : step * cols]).reshape(-1)
-    points = raw.view(dtype) if n else np.empty(0, dtype)
-    xyz = np.column_stack([points[c] for c in "xyz"]).astype(np.float32)
-    bad = np.flatnonzero(~np.isfinite(xyz).all(axis=1))
-    if bad.size:
-        raise AdapterError(
-            f"{where} has {bad.size} of {n} points not finite, the first at {bad[0]}"
-            f" ({xyz[bad[0]].tolist()}); expected finite metres"
-        )
-    views = points["views"]
-    return Voxels(
-        stamp_to_ns(msg.header.stamp, f"{where}.header.stamp"),
-        xyz,
-        points["l_out"].astype(np.float32),
-        views.astype(views.dtype.newbyteorder("=")),
-    )
+    return raw.view(dtype)
