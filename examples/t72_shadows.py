@@ -20,6 +20,7 @@ import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -193,68 +194,88 @@ def agreement(result: Result, views: list[View]) -> NDArray[np.float64]:
     return np.array(rows)
 
 
+def along_hull(points: Any, body: Dimensions) -> NDArray[np.float64]:
+    """Turn points so that the body's length lies along the first axis, its middle at the origin."""
+    c, s = math.cos(body.heading_rad), math.sin(body.heading_rad)
+    out = np.array(points, dtype=np.float64)
+    out[..., :2] = (out[..., :2] - body.position_m) @ np.array([[c, s], [-s, c]]).T
+    return out
+
+
+def draw_surface(axes: Any, triangles: NDArray[np.float64], height_m: float, span_m: float) -> None:
+    """Draw a surface in 3-D, lit from one side, coloured by height."""
+    import matplotlib.pyplot as plt
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    light = np.clip(normals @ np.array([-0.45, -0.55, 0.7]), 0.0, 1.0)
+    height = np.clip(triangles[:, :, 2].mean(axis=1) / height_m, 0, 1)
+    colours = plt.get_cmap("viridis")(0.15 + 0.75 * height)
+    colours[:, :3] *= (0.35 + 0.65 * light)[:, None]
+    axes.add_collection3d(Poly3DCollection(triangles, facecolors=colours, edgecolors="none", shade=False))
+    axes.set(xlim=(-span_m, span_m), ylim=(-span_m, span_m), zlim=(0, 2.8))
+    axes.set(xlabel="along the hull (m)", ylabel="across (m)")
+    axes.set_zlabel("height (m)")
+    axes.set_box_aspect((2 * span_m, 2 * span_m, 2.8))
+    axes.view_init(elev=28, azim=-58)
+
+
+def draw_voxels(
+    panel: Any,
+    points: NDArray[np.float64],
+    body: NDArray[np.bool_],
+    true_m: tuple[float, float],
+    measured_m: tuple[float, float],
+    *,
+    above: bool,
+) -> None:
+    """Draw voxels from above or from the side, those of the body apart, with its true and measured size."""
+    import matplotlib.pyplot as plt
+
+    for chosen, colour, label in ((~body, "tab:orange", "thin parts"), (body, "tab:blue", "body")):
+        panel.plot(points[chosen, 0], points[chosen, 1], "s", ms=3, color=colour, label=label)
+    for (w, h), colour, label in (
+        (true_m, "k", f"true hull {true_m[0]} × {true_m[1]} m"),
+        (measured_m, "r", f"measured body {measured_m[0]:.2f} × {measured_m[1]:.2f} m"),
+    ):
+        corner = (-w / 2, -h / 2 if above else 0.0)
+        panel.add_patch(plt.Rectangle(corner, w, h, fill=False, ec=colour, ls="--", lw=1.5, label=label))
+    panel.set_ylabel("across (m)" if above else "height (m)")
+    panel.set_ylim((-3, 3) if above else (-0.2, 3.4))
+    panel.legend(fontsize=7, loc="upper right", ncols=2)
+
+
 def draw_shape(path: Path, result: Result, shape: Shape, title: str) -> None:
     """Draw the carved surface in 3-D, from above and from the side."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    mesh = result.mesh
-    if mesh is None or result.grid is None:
+    if result.mesh is None or result.grid is None:
         raise NoTargetError("there is no surface to draw")
     d = shape.body
-    # Turn the object so that its length lies along the first axis.
-    c, s = math.cos(d.heading_rad), math.sin(d.heading_rad)
-    turn = np.array([[c, s], [-s, c]])
-
-    def local(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        out = np.array(points, dtype=np.float64)
-        out[..., :2] = (out[..., :2] - d.position_m) @ turn.T
-        return out
-
-    triangles = local(np.asarray(mesh.triangles))
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    light = np.clip(normals @ np.array([-0.45, -0.55, 0.7]), 0.0, 1.0)
-    height = np.clip(triangles[:, :, 2].mean(axis=1) / d.height_m, 0, 1)
-    colours = plt.get_cmap("viridis")(0.15 + 0.75 * height)
-    colours[:, :3] *= (0.35 + 0.65 * light)[:, None]
-
+    triangles = along_hull(result.mesh.triangles, d)
+    span = float(np.abs(triangles[..., :2]).max()) * 1.02
     figure = plt.figure(figsize=(14, 6.5), layout="constrained")
     panels = figure.add_gridspec(2, 2, width_ratios=(1.1, 1), height_ratios=(1.6, 1))
     axes = figure.add_subplot(panels[:, 0], projection="3d")
-    axes.add_collection3d(Poly3DCollection(triangles, facecolors=colours, edgecolors="none", shade=False))
-    span = float(np.abs(triangles[..., :2]).max()) * 1.02
-    axes.set(xlim=(-span, span), ylim=(-span, span), zlim=(0, 2.8))
-    axes.set(xlabel="along the hull (m)", ylabel="across (m)")
-    axes.set_zlabel("height (m)")
-    axes.set_box_aspect((2 * span, 2 * span, 2.8))
-    axes.view_init(elev=28, azim=-58)
+    draw_surface(axes, triangles, d.height_m, span)
     axes.set_title(title)
 
     volume = result.grid.volume
     zz, yy, xx = np.nonzero(result.grid.occupied)
-    points = local(np.column_stack([volume.x_m[xx], volume.y_m[yy], volume.z_m[zz]]))
+    points = along_hull(np.column_stack([volume.x_m[xx], volume.y_m[yy], volume.z_m[zz]]), d)
     body = body_of(result.grid).occupied[zz, yy, xx]
-    for row, (second, name, true, size) in enumerate(
+    for row, (other, name, true, size) in enumerate(
         ((1, "from above", TRUE_M[1], d.width_m), (2, "from the side", TRUE_M[2], d.height_m))
     ):
         panel = figure.add_subplot(panels[row, 1])
-        for chosen, colour, label in ((~body, "tab:orange", "thin parts"), (body, "tab:blue", "body")):
-            panel.plot(points[chosen, 0], points[chosen, second], "s", ms=3, color=colour, label=label)
-        low = -true / 2 if second == 1 else 0.0
-        low_m = -size / 2 if second == 1 else 0.0
-        for x, y, w, h, colour, label in (
-            (-TRUE_M[0] / 2, low, TRUE_M[0], true, "k", f"true hull {TRUE_M[0]} × {true} m"),
-            (-d.length_m / 2, low_m, d.length_m, size, "r", f"measured body {d.length_m:.2f} × {size:.2f} m"),
-        ):
-            panel.add_patch(plt.Rectangle((x, y), w, h, fill=False, ec=colour, ls="--", lw=1.5, label=label))
         panel.set(aspect="equal", xlim=(-span, span), xlabel="along the hull (m)", title=name)
-        panel.set_ylabel("across (m)" if second == 1 else "height (m)")
-        panel.set_ylim((-3, 3) if second == 1 else (-0.2, 3.4))
-        panel.legend(fontsize=7, loc="upper right", ncols=2)
+        draw_voxels(
+            panel, points[:, [0, other]], body, (TRUE_M[0], true), (d.length_m, size), above=other == 1
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=80)
     plt.close(figure)

@@ -1,4 +1,4 @@
-"""No file and no room of the packages imports in a circle."""
+"""No file and no room of the packages imports in a circle, and no function is too long to be read at once."""
 
 from __future__ import annotations
 
@@ -14,6 +14,10 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("csas_shadow_ros", "msg_adapters")
 #: Edges between rooms that close a circle and are wanted: (from, to). None is.
 ALLOWED: set[tuple[str, str]] = set()
+#: Where functions are held to a length; ruff holds their branches to 12, and has no rule for lines.
+OF_SHORT_FUNCTIONS = (*PACKAGES, "launch", "examples")
+#: Lines of a function without its docstring, at most. Kernels may have more: compiled loops have no seams.
+MOST_LINES = 60
 
 
 @dataclass(frozen=True)
@@ -140,3 +144,56 @@ def test_a_circle_is_found_in_files_and_rooms(tmp_path):
     (tmp_path / PACKAGES[0] / "core/c.py").write_text("from .a import b\nfrom ..bags import d\n")
     assert len(circle_in({(i.importer, i.imported) for i in imports_of(made) if not i.late})) == 4
     assert circle_in(room_edges(made)) in (["core", "bags", "core"], ["bags", "core", "bags"])
+
+
+def lines_of(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Count a function's lines from its name on; those of its docstring do not count."""
+    assert function.end_lineno is not None
+    doc = function.body[0] if ast.get_docstring(function, clean=False) is not None else None
+    return function.end_lineno - function.lineno + 1 - (doc.end_lineno - doc.lineno + 1 if doc else 0)
+
+
+def is_kernel(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    """Say whether `core.kernels.kernel` compiles a function."""
+    return any(ast.unparse(decorator).startswith("kernel(") for decorator in function.decorator_list)
+
+
+def long_functions(root: Path) -> list[str]:
+    """Return each function below a folder that is too long and no kernel: its file, name and lines."""
+    return [
+        f"{path.relative_to(root)}: {node.name} has {lines_of(node)} lines"
+        for folder in OF_SHORT_FUNCTIONS
+        for path in sorted((root / folder).rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and lines_of(node) > MOST_LINES
+        and not is_kernel(node)
+    ]
+
+
+def test_no_function_but_kernels_is_longer_than_60_lines():
+    assert long_functions(ROOT) == []
+
+
+def test_a_long_function_is_found_by_its_lines_without_the_docstring(tmp_path):
+    def function(name: str, lines: int, doc: str = "", before: str = "def") -> str:
+        return f"{before} {name}():\n" + doc + "    pass\n" * (lines - 1)
+
+    doc = '    """Do so.\n\n    At length.\n    """\n'
+    methods = "\n".join(f"    {line}" for line in function("method", 62).splitlines())
+    path = tmp_path / "launch" / "deep" / "one.py"
+    path.parent.mkdir(parents=True)
+    path.write_text(
+        function("short", MOST_LINES, doc)
+        + function("long", MOST_LINES + 1, doc)
+        + function("awaited", MOST_LINES + 5, before="async def")
+        + "@kernel()\n"
+        + function("compiled", 90)
+        + "@cache\n"
+        + function("cached", 90)
+        + f"class Thing:\n{methods}\n"
+    )
+    assert long_functions(tmp_path) == [
+        f"launch/deep/one.py: {name} has {lines} lines"
+        for name, lines in (("long", 61), ("awaited", 65), ("cached", 90), ("method", 62))
+    ]

@@ -147,100 +147,158 @@ def drift(values: list[int]) -> dict[str, float]:
     }
 
 
-def go(given: argparse.Namespace) -> dict[str, Any]:
-    """Circle after circle."""
-    rng = random.Random(given.seed)
-    bags = Bags(given.bags)
-    runs = [(scene, read_run(bags.path(scene))) for scene in Bags.SCENES[:3]]
-    line: dict[str, Any] = {"kills": [], "faults": [], "circle_s": [], "grids": 0}
-    memory: dict[str, list[int]] = {}
-    kills_left = given.kills if given.kills >= 0 else rng.randint(2, 6)
-    # In a graph that lives long, forked nodes alone are killed: without its server each takes long to start.
-    victims = [*PLAN, *([] if given.kills_a_circle else ["fork_server"])]
-    began = time.monotonic()
-    recording = given.folder / "recording"
-    with contextlib.ExitStack() as stack:
+class Voyage:
+    """A vehicle that sails circle after circle past a graph whose processes are killed, and what came of it.
+
+    Parameters
+    ----------
+    given : argparse.Namespace
+        The command line.
+    """
+
+    def __init__(self, given: argparse.Namespace) -> None:
+        self.given = given
+        self.rng = random.Random(given.seed)
+        self.bags = Bags(given.bags)
+        self.runs = [(scene, read_run(self.bags.path(scene))) for scene in Bags.SCENES[:3]]
+        self.line: dict[str, Any] = {"kills": [], "faults": [], "circle_s": [], "grids": 0}
+        self.memory: dict[str, list[int]] = {}
+        self.kills_left = given.kills if given.kills >= 0 else self.rng.randint(2, 6)
+        self.circle = 0
+        self.began = time.monotonic()
+
+    def sail(self) -> dict[str, Any]:
+        """Sail all circles; return what was seen."""
+        with contextlib.ExitStack() as stack:
+            self._start(stack)
+            while self.circle < self.given.circles or time.monotonic() - self.began < self.given.seconds:
+                if not self._sail_circle():
+                    return self.line
+                self._rest()
+            self._finish()
+        self.line |= {"circles": self.circle, "wall_s": round(time.monotonic() - self.began, 1)}
+        if self.memory:
+            self._tell_of_memory()
+        return self.line
+
+    def _start(self, stack: contextlib.ExitStack) -> None:
+        """Start the graph, with all its nodes in the namespace, and the vehicle."""
+        given = self.given
         domain = given.domain if given.domain >= 0 else stack.enter_context(DomainReservation())
         logs = given.folder / "log"
         graph_id = new_graph_id()
-        server = stack.enter_context(start_fork_server(domain, logs, graph_id))
+        self.server = stack.enter_context(start_fork_server(domain, logs, graph_id))
+        recording = given.folder / "recording"
         plan = {**PLAN, "bag_recorder": {**PLAN["bag_recorder"], "out": str(recording)}}
-        graph = Graph(plan, domain, logs, 1000, server, graph_id)
-        for process in graph.processes.values():
+        self.graph = Graph(plan, domain, logs, 1000, self.server, graph_id)
+        for process in self.graph.processes.values():
             process._arguments = [*(process._arguments or ["--ros-args"]), "-r", f"__ns:={given.namespace}"]
-        stack.enter_context(graph)
-        vehicle = Vehicle(graph, domain, given.namespace)
-        stack.callback(vehicle.close)
-        circle = 0
-        while circle < given.circles or time.monotonic() - began < given.seconds:
-            scene, bag = runs[(circle + given.first) % len(runs)]
-            name, expected = vehicle.send(bag, circle * APART_NS), bags.live_hash(scene)
-            since = time.monotonic()
-            share = (kills_left + 1) // 2 if circle + 1 < given.circles else kills_left
-            count = rng.randint(1, given.kills_a_circle) if given.kills_a_circle else share
-            span_s = 6.0 if circle else 9.0
-            due = sorted((since + rng.uniform(0.0, span_s), rng.choice(victims)) for _ in range(count))
-            while name not in vehicle.final:
-                graph.watch()
-                vehicle.executor.spin_once(timeout_sec=0.05)
-                while due and time.monotonic() > due[0][0]:
-                    victim = due.pop(0)[1]
-                    kills_left = max(kills_left - 1, 0)
-                    if victim == "fork_server" and server is None:
-                        continue
-                    pid = server.pid if victim == "fork_server" and server else graph.processes[victim].pid
-                    with contextlib.suppress(ProcessLookupError):
-                        os.kill(pid, signal.SIGKILL)
-                        line["kills"].append((round(time.monotonic() - began, 2), victim))
-                if time.monotonic() - since > PATIENCE_S:
-                    line["faults"].append(f"hung: circle {circle} is not at its end after {PATIENCE_S:g} s")
-                    return line
-            found, views = vehicle.final[name]
-            if (found, views) != (expected, 36):
-                line["faults"].append(f"the grid differs: circle {circle} of {scene}: {found}, {views} views")
-            line["grids"] += found == expected
-            line["circle_s"].append(round(time.monotonic() - since, 1))
-            if given.seconds:
-                for node, process in graph.processes.items():
-                    memory.setdefault(node, []).append(memory_kb(process.pid))
-                if server is not None:
-                    memory.setdefault("fork_server", []).append(memory_kb(server.pid))
-                with (given.folder / "memory.jsonl").open("a") as file:
-                    file.write(json.dumps({k: v[-1] for k, v in memory.items()}) + "\n")
-                for old in given.folder.glob("recording*"):
-                    if (old / "metadata.yaml").exists():
-                        shutil.rmtree(old)  # a soak would fill the disk
-            circle += 1
-            with (given.folder / "circles.jsonl").open("a", encoding="utf-8") as file:
-                told = {k: v if isinstance(v, int) else len(v) for k, v in line.items()}
-                file.write(json.dumps(told) + "\n")
-            rest = time.monotonic() + given.rest
-            while time.monotonic() < rest:
-                graph.watch()
-                vehicle.executor.spin_once(timeout_sec=0.05)
+        stack.enter_context(self.graph)
+        self.vehicle = Vehicle(self.graph, domain, given.namespace)
+        stack.callback(self.vehicle.close)
+
+    def _look(self) -> None:
+        """Start again what died, and take what came."""
+        self.graph.watch()
+        self.vehicle.executor.spin_once(timeout_sec=0.05)
+
+    def _sail_circle(self) -> bool:
+        """Send a run, kill while it is worked on, and hold its grid against the bag's; False if it hung."""
+        scene, bag = self.runs[(self.circle + self.given.first) % len(self.runs)]
+        name, expected = self.vehicle.send(bag, self.circle * APART_NS), self.bags.live_hash(scene)
+        since = time.monotonic()
+        due = self._kills_due(since)
+        while name not in self.vehicle.final:
+            self._look()
+            while due and time.monotonic() > due[0][0]:
+                self._kill(due.pop(0)[1])
+            if time.monotonic() - since > PATIENCE_S:
+                self.line["faults"].append(
+                    f"hung: circle {self.circle} is not at its end after {PATIENCE_S:g} s"
+                )
+                return False
+        found, views = self.vehicle.final[name]
+        if (found, views) != (expected, 36):
+            self.line["faults"].append(
+                f"the grid differs: circle {self.circle} of {scene}: {found}, {views} views"
+            )
+        self.line["grids"] += found == expected
+        self.line["circle_s"].append(round(time.monotonic() - since, 1))
+        if self.given.seconds:
+            self._measure_memory()
+        self.circle += 1
+        with (self.given.folder / "circles.jsonl").open("a", encoding="utf-8") as file:
+            told = {k: v if isinstance(v, int) else len(v) for k, v in self.line.items()}
+            file.write(json.dumps(told) + "\n")
+        return True
+
+    def _kills_due(self, since: float) -> list[tuple[float, str]]:
+        """Draw what is killed during a circle, and when."""
+        given, rng = self.given, self.rng
+        # In a graph that lives long, forked nodes alone are killed: without its server each takes long to
+        # start.
+        victims = [*PLAN, *([] if given.kills_a_circle else ["fork_server"])]
+        share = (self.kills_left + 1) // 2 if self.circle + 1 < given.circles else self.kills_left
+        count = rng.randint(1, given.kills_a_circle) if given.kills_a_circle else share
+        span_s = 6.0 if self.circle else 9.0
+        return sorted((since + rng.uniform(0.0, span_s), rng.choice(victims)) for _ in range(count))
+
+    def _kill(self, victim: str) -> None:
+        self.kills_left = max(self.kills_left - 1, 0)
+        if victim != "fork_server":
+            pid = self.graph.processes[victim].pid
+        elif self.server is not None:
+            pid = self.server.pid
+        else:
+            return
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+            self.line["kills"].append((round(time.monotonic() - self.began, 2), victim))
+
+    def _measure_memory(self) -> None:
+        """Note what each process holds, and remove finished recordings: a soak would fill the disk."""
+        for node, process in self.graph.processes.items():
+            self.memory.setdefault(node, []).append(memory_kb(process.pid))
+        if self.server is not None:
+            self.memory.setdefault("fork_server", []).append(memory_kb(self.server.pid))
+        with (self.given.folder / "memory.jsonl").open("a") as file:
+            file.write(json.dumps({k: v[-1] for k, v in self.memory.items()}) + "\n")
+        for old in self.given.folder.glob("recording*"):
+            if (old / "metadata.yaml").exists():
+                shutil.rmtree(old)
+
+    def _rest(self) -> None:
+        """Let time pass between two circles."""
+        until = time.monotonic() + self.given.rest
+        while time.monotonic() < until:
+            self._look()
+
+    def _finish(self) -> None:
+        """End the graph once the recorder has every view; look for views that were lost or not recorded."""
         # What the recorder lacks yet is sent again before the source says that it has finished.
         end = time.monotonic() + 60.0
-        names = ["recording", *(f"recording_{n}" for n in range(2, circle + 1))]
-        while not given.seconds and time.monotonic() < end and not recorded(vehicle):
-            graph.watch()
-        if vehicle.lost:
-            line["faults"].append(f"views lost: {vehicle.lost}")
-        line["lost"] = sum(vehicle.lost.values())
-        vehicle.executor.spin_once(timeout_sec=0.1)
-        graph.stop()
-        if not given.seconds:
-            for folder in names:
-                counts = read_run(given.folder / folder).counts
-                if short := {s: counts.get(s, 0) for s in STREAMS if counts.get(s, 0) != 36}:
-                    line["faults"].append(f"{folder} lacks views: {short}")
-    line |= {"circles": circle, "wall_s": round(time.monotonic() - began, 1)}
-    if memory:
-        line["memory"] = {node: drift(values) for node, values in memory.items()}
+        while not self.given.seconds and time.monotonic() < end and not recorded(self.vehicle):
+            self.graph.watch()
+        if self.vehicle.lost:
+            self.line["faults"].append(f"views lost: {self.vehicle.lost}")
+        self.line["lost"] = sum(self.vehicle.lost.values())
+        self.vehicle.executor.spin_once(timeout_sec=0.1)
+        self.graph.stop()
+        if self.given.seconds:
+            return
+        for folder in ("recording", *(f"recording_{n}" for n in range(2, self.circle + 1))):
+            counts = read_run(self.given.folder / folder).counts
+            if short := {s: counts.get(s, 0) for s in STREAMS if counts.get(s, 0) != 36}:
+                self.line["faults"].append(f"{folder} lacks views: {short}")
+
+    def _tell_of_memory(self) -> None:
+        """Say how memory changed over the soak; growth of a twentieth is a fault."""
+        line = self.line
+        line["memory"] = {node: drift(values) for node, values in self.memory.items()}
         line["circle_s"] = line["circle_s"][:: max(len(line["circle_s"]) // 20, 1)]
         for node, told in line["memory"].items():
             if abs(told.get("change_percent", 0.0)) > 5.0:
                 line["faults"].append(f"memory of {node} is not flat: {told}")
-    return line
 
 
 def recorded(vehicle: Vehicle) -> bool:
@@ -278,7 +336,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="contact to begin with")
     parser.add_argument("--domain", type=int, default=-1)
     parser.add_argument("--namespace", default="/csas")
-    print(json.dumps(go(parser.parse_args())), flush=True)
+    print(json.dumps(Voyage(parser.parse_args()).sail()), flush=True)
     return 0
 
 
