@@ -14,6 +14,7 @@ import numpy as np
 
 from .bags import BagReader, Problem, Run, read_run
 from .bags.metadata import read_metadata
+from .bags.pairs import first_of_alike
 from .bags.run import sectors_of_one_run
 from .core.errors import BagError, CsasError, check_type
 from .core.geometry import CoherentImage, Track
@@ -281,12 +282,7 @@ def _take_replay(context: Context, replayed: ReplayResult, run: Run, image: Cohe
 
 def told_once(problems: Sequence[Problem]) -> list[str]:
     """Return problems as lines; what is wrong with many messages alike is one line."""
-    alike: dict[tuple[str, str], list[Problem]] = {}
-    for problem in problems:
-        alike.setdefault((problem.topic, problem.reason), []).append(problem)
-    return [
-        str(same[0]) + (f" ({len(same)} messages alike)" if len(same) > 1 else "") for same in alike.values()
-    ]
+    return [f"{first}{more}" for first, more in first_of_alike(problems, lambda p: (p.topic, p.reason))]
 
 
 def describe_image(image: CoherentImage) -> dict[str, Any]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import signal
 import threading
-import webbrowser
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +10,7 @@ from pathlib import Path
 from aiohttp import web
 
 from ..core.errors import ParameterError
+from ..viewer.command import serve_until, set_by_signals
 from ..viewer.server import ViewerServer
 from ..viewer.source import PathSource
 from ..viewer.store import ViewStore
@@ -115,13 +114,6 @@ def view_archive(
     CsasError
         If it has no catalogue, a library is missing, or the address cannot be had.
     """
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = set_by_signals()
     server = ArchiveServer(Content(root), host, port, token)
-    server.start()
-    say(server.url)
-    if browser:
-        webbrowser.open(server.url)
-    stop.wait()
-    server.stop()
+    serve_until(stop, server, browser=browser, say=say)

@@ -26,7 +26,7 @@ from msg_adapters.pairs import (
 from msg_adapters.topics import STREAMS, TOPICS, VIEW_STREAMS, VOXEL_STREAMS, absolute_name, split_prefix
 
 from .bag import BagReader
-from .pairs import Problem, iterate_pairs
+from .pairs import Problem, first_of_alike, iterate_pairs
 from .run import Run, read_run
 from .tracks import BagRuns
 
@@ -147,14 +147,8 @@ class CheckReport:
 
     def _told_once(self) -> list[str]:
         """Return the findings as text; what is said of many messages alike, of the first of them."""
-        alike: dict[tuple[str, str, str], list[Finding]] = {}
-        for finding in self.findings:
-            alike.setdefault((finding.level, finding.topic, finding.problem), []).append(finding)
-        texts = []
-        for same in alike.values():
-            more = f" ({len(same)} messages alike)" if len(same) > 1 else ""
-            texts.append(str(dataclasses.replace(same[0], problem=same[0].problem + more)))
-        return texts
+        alike = first_of_alike(self.findings, lambda f: (f.level, f.topic, f.problem))
+        return [str(dataclasses.replace(first, problem=first.problem + more)) for first, more in alike]
 
 
 def check_bag(path: str | Path, namespace: str | None = None, run: int | None = None) -> CheckReport:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from csas_shadow_ros.core.errors import CsasError
 from msg_adapters.messages import quoted, stamp_to_ns
 from msg_adapters.topics import TOPICS, absolute_name, stream
 
 from .bag import BagMessage, BagReader
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,14 @@ class Problem:
         if self.stamp_ns is not None:
             place += f" ({self.stamp_ns} ns)"
         return f"{place}: {self.reason}" if place else self.reason
+
+
+def first_of_alike(items: Iterable[T], kind: Callable[[T], Hashable]) -> list[tuple[T, str]]:
+    """Return the first of what is alike, and a note of how many messages are; the note of one is empty."""
+    alike: dict[Hashable, list[T]] = {}
+    for item in items:
+        alike.setdefault(kind(item), []).append(item)
+    return [(same[0], f" ({len(same)} messages alike)" if len(same) > 1 else "") for same in alike.values()]
 
 
 @dataclass(frozen=True, eq=False)

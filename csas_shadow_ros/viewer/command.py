@@ -32,18 +32,40 @@ def view(
     ViewerError, BagError
         If there is nothing to see, or the address cannot be had.
     """
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = set_by_signals()
     store = ViewStore()
     source = PathSource(store, path, namespace)
     other = None if second is None else Second(store, second, namespace)
     server = ViewerServer(store, host, port, token)
+
+    def read() -> None:
+        source.start()
+        if other is not None:
+            other.start()
+
+    serve_until(stop, server, browser=browser, say=say, then=read)
+
+
+def set_by_signals() -> threading.Event:
+    """Return an event that SIGINT and SIGTERM set from now on."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+def serve_until(
+    stop: threading.Event,
+    server: ViewerServer,
+    *,
+    browser: bool,
+    say: Callable[[str], None],
+    then: Callable[[], None] = lambda: None,
+) -> None:
+    """Serve a page, say where, do what is to be done `then`, and open a browser; until `stop` is set."""
     server.start()
     say(server.url)
-    source.start()
-    if other is not None:
-        other.start()
+    then()
     if browser:
         webbrowser.open(server.url)
     stop.wait()
