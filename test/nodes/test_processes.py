@@ -628,19 +628,22 @@ def test_a_node_begins_anew_until_nobody_writes_to_a_file_that_its_port_has_repl
         while len(ports()) != 2:
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        with holding(*ports()) as (remove, end):
+        before = set(ports())
+        with holding(*before) as (remove, _):  # for good
             os.kill(process.pid, signal.SIGKILL)
             remove()
             while "begins anew" not in process.log.read_text():
                 assert time.monotonic() < deadline
                 graph.watch()
                 time.sleep(0.05)
-            end()
-        said = process.log.read_text().count("begins anew")
-        time.sleep(15.0)
-        assert process.log.read_text().count("begins anew") <= said + 1
-        assert process.poll() is None
-        assert process.log.read_text().rstrip().splitlines()[-1].split("]: ")[1].startswith("active")
+            pid = process.pid
+            time.sleep(15.0)
+            assert process.log.read_text().count("begins anew") == 1
+            assert process.poll() is None
+            assert process.pid == pid
+            owned = {Path(path.removesuffix("_el")) for path in links(pid) if path.endswith("_el")}
+            assert len({str(p) for p in owned if p.exists() and "_port" in p.name} - before) == 2
+            assert process.log.read_text().rstrip().splitlines()[-1].split("]: ")[1].startswith("active")
 
 
 def links(pid: int) -> list[str]:

@@ -68,7 +68,7 @@ from msg_adapters.topics import topic as topic_of
 
 from .. import qos
 from .flow import Flow
-from .hearing import LET_GO_S, Reach, make_hearing
+from .hearing import Reach, make_hearing
 from .host import Host
 from .params import DYNAMIC, NODES, declare, from_overrides
 from .rivals import Rivals
@@ -1264,7 +1264,7 @@ def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> in
         reach, code = _run_once(kind, make, take_back, stop)
         if not reach.is_given_up or stop.is_set():
             return code
-        time.sleep(LET_GO_S)
+        reach.take_others()
 
 
 def _run_once(
@@ -1345,7 +1345,8 @@ def spin(node: CsasNode, stop: threading.Event, reach: Reach | None = None) -> N
                 return  # whoever started us is gone without ending us
             if reach is not None and reach.is_lost():
                 node.get_logger().warning(
-                    "others send to a port in shared memory of a killed predecessor: this node begins anew"
+                    "others send to a port in shared memory of a killed predecessor: this node begins anew at"
+                    " other ports"
                 )
                 return
     finally:

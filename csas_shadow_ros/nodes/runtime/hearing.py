@@ -9,13 +9,16 @@ writing to that (`Reach`).
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import gc
 import os
 import re
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
+
+from .shared_memory import bound
 
 Made = TypeVar("Made")
 
@@ -28,9 +31,10 @@ _DELETED = re.compile(rf"({_SHARED}port\d+) \(deleted\)")
 _PORTS = 2
 #: A process that is killed lets go of its ports within milliseconds, on a busy one within seconds.
 _PATIENCE_S, _AGAIN_S = 10.0, 0.2
-#: When (s after a start) to look for older files of its ports, and how long to leave ports without an owner:
-#: every process looks once a second for such ports, and closes them.
-_LOOKS_S, LET_GO_S = (5.0, 8.0), 2.0
+#: When (s after a start) to look for older files of its ports.
+_LOOKS_S = (5.0, 8.0)
+#: What keeps ports from this process' next participant, for as long as the process lives: port → its holders.
+_kept: dict[str, list[Any]] = {}
 
 
 def _held() -> tuple[int, set[str]]:
@@ -67,7 +71,7 @@ class Reach:
     """
 
     def __init__(self) -> None:
-        self._ports = _held()[1] if os.path.isdir(_FILES) else set()
+        self._ports = _held()[1] - _kept.keys() if os.path.isdir(_FILES) else set()
         began_s = time.monotonic()
         self._looks_s = [began_s + after_s for after_s in _LOOKS_S] if self._ports else []
         #: Whether it was found that they do not.
@@ -83,6 +87,18 @@ class Reach:
             self._looks_s = []
         self.is_given_up = bool(self._ports) and not self._looks_s
         return self.is_given_up
+
+    def take_others(self) -> None:
+        """Keep the ports that are written past from this process' next participant: it takes others."""
+        for port in sorted(self._ports):
+            number, holders = int(port.rpartition("_port")[2]), _kept.setdefault(port, [])
+            # The middleware numbers a participant by the first of its UDP ports that is free, which is even;
+            # the port that is not numbered so is the first one whose lock is free.
+            if number % 2:
+                holders.append(bound(number - 1))
+            with contextlib.suppress(OSError):
+                holders.append(Path(port + _OWNER).open("ab"))  # noqa: SIM115 (held for good)
+                fcntl.flock(holders[-1], fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def make_hearing(make: Callable[[], Made], take_back: Callable[[Made], None]) -> Made:
