@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import resource
 import signal
 import sys
 import threading
@@ -21,7 +20,7 @@ from ..core.errors import ParameterError
 from .catalogue import Catalogue, failed_line
 from .layout import Archive
 from .sources import bags_of, signature_of
-from .task import Options, Redo, Reply, Task, give_up, process
+from .task import Options, Redo, Reply, Task, give_up, peak_mb, process
 from .workers import WorkerDiedError, Workers
 
 #: How often (s) is looked whether somebody wants an end, or rows have waited for long.
@@ -227,7 +226,7 @@ def run_batch(
         summary.runs = batch.catalogue.merge()
         summary.seconds = time.monotonic() - began
         summary.interrupted = stop.times > 0
-        summary.memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000.0
+        summary.memory_mb = peak_mb()
         return summary
 
 

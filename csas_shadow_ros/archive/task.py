@@ -147,7 +147,7 @@ def process(task: Task) -> Reply:
                 return Reply(task.bag, False, rows_of(folder, known, archive.root))
         record.runs = [PartOfTask(reason=unreadable)] if unreadable else _process_runs(task, bag, folder)
         record.seconds = time.perf_counter() - began
-        record.peak_memory_mb = _peak_mb()
+        record.peak_memory_mb = peak_mb()
         return _finish(record, folder, archive, durable=task.durable)
 
 
@@ -258,7 +258,8 @@ def _forget_peak() -> None:
         Path("/proc/self/clear_refs").write_text("5")
 
 
-def _peak_mb() -> float:
+def peak_mb() -> float:
+    """Return this program's peak of memory; `getrusage` would begin with that of whoever started it."""
     try:
         found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     except OSError:
