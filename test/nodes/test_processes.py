@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import mmap
 import os
 import signal
 import subprocess
@@ -611,6 +612,26 @@ def test_it_is_found_out_that_others_write_to_a_file_that_a_port_has_replaced(
         end()
         assert not reach.is_lost(), "as a rule it is let go of"
         assert not reach.is_given_up
+
+
+def test_it_is_found_out_that_an_own_port_was_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hearing, "_LOOKS_S", ())
+    monkeypatch.setattr(hearing, "_OWN_LOOK_S", 0.0)
+    port = Path(f"/dev/shm/fastrtps_port{71_000 + os.getpid()}")
+    owner = port.with_name(f"{port.name}_el")
+    port.write_bytes(b"\0" * 4096)
+    with contextlib.ExitStack() as stack:
+        for path in (port, owner):
+            stack.callback(path.unlink, missing_ok=True)
+        stack.enter_context(owner.open("w"))
+        file = stack.enter_context(port.open("r+b"))
+        stack.enter_context(mmap.mmap(file.fileno(), 0))
+        reach = hearing.Reach()
+        assert not reach.is_lost()
+        port.unlink()
+        port.write_bytes(b"\0" * 4096)
+        assert reach.is_lost()
+        assert reach.is_given_up
 
 
 @pytest.mark.long

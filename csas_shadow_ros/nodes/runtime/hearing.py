@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import gc
+import math
 import os
 import re
 import time
@@ -31,8 +32,9 @@ _DELETED = re.compile(rf"({_SHARED}port\d+) \(deleted\)")
 _PORTS = 2
 #: A process that is killed lets go of its ports within milliseconds, on a busy one within seconds.
 _PATIENCE_S, _AGAIN_S = 10.0, 0.2
-#: When (s after a start) to look for older files of its ports.
-_LOOKS_S = (5.0, 8.0)
+#: When (s after a start) to look for older files of its ports that others have open, and how often (s) to
+#: look whether its own are still those that others find.
+_LOOKS_S, _OWN_LOOK_S = (5.0, 8.0), 5.0
 #: What keeps ports from this process' next participant, for as long as the process lives: port → its holders.
 _kept: dict[str, list[Any]] = {}
 
@@ -57,29 +59,44 @@ def _replaced(ports: set[str]) -> set[str]:
     """Return those ports of which another process has an older file open: nobody reads what it writes."""
     found: set[str] = set()
     for other in Path("/proc").glob("[0-9]*/maps"):
-        # Of another user, or gone meanwhile.
-        with contextlib.suppress(OSError):
-            found |= set(_DELETED.findall(other.read_text(errors="replace")))
+        found |= _deleted(other)
     return ports & found
+
+
+def _deleted(maps: Path) -> set[str]:
+    """Return the ports of which a process has a file open that is no longer there."""
+    with contextlib.suppress(OSError):  # of another user, or gone meanwhile
+        return set(_DELETED.findall(maps.read_text(errors="replace")))
+    return set()
 
 
 class Reach:
     """Whether others reach this process at the ports that it has made.
 
     A file that is replaced is let go of within 3 s as a rule, when the middleware finds that nobody reads it.
-    It is looked for twice, later than that.
+    It is looked for twice, later than that. Another process may also replace the port of one that is alive
+    but has had no processor for as long as the middleware waits for a sign of it
+    (`healthy_check_timeout_ms`).
     """
 
     def __init__(self) -> None:
         self._ports = _held()[1] - _kept.keys() if os.path.isdir(_FILES) else set()
         began_s = time.monotonic()
         self._looks_s = [began_s + after_s for after_s in _LOOKS_S] if self._ports else []
+        self._own = set(self._ports)
+        self._own_look_s = began_s + _OWN_LOOK_S if self._ports else math.inf
         #: Whether it was found that they do not.
         self.is_given_up = False
 
     def is_lost(self) -> bool:
         """Say whether somebody goes on writing to what this process does not read."""
-        if not self._looks_s or time.monotonic() < self._looks_s[0]:
+        now_s = time.monotonic()
+        if now_s >= self._own_look_s:
+            self._own_look_s = now_s + _OWN_LOOK_S
+            if lost := self._own & _deleted(Path("/proc/self/maps")):
+                self._ports, self._looks_s, self.is_given_up = lost, [], True
+                return True
+        if not self._looks_s or now_s < self._looks_s[0]:
             return False
         del self._looks_s[0]
         self._ports = _replaced(self._ports)
