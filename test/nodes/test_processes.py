@@ -589,17 +589,23 @@ def holding(*paths: Path | str) -> Iterator[tuple[Callable[[], None], Callable[[
         holder.kill()
 
 
+@pytest.fixture
+def port() -> Iterator[Path]:
+    """A file that this process owns as the middleware does a port's."""
+    file = Path(f"/dev/shm/fastrtps_port{70_000 + os.getpid()}")
+    owner = file.with_name(f"{file.name}_el")
+    file.write_bytes(b"\0" * 4096)
+    with owner.open("w"):
+        yield file
+    for path in (file, owner):
+        path.unlink(missing_ok=True)
+
+
 def test_it_is_found_out_that_others_write_to_a_file_that_a_port_has_replaced(
-    monkeypatch: pytest.MonkeyPatch,
+    port: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hearing, "_LOOKS_S", (0.0, 0.0))
-    port = Path(f"/dev/shm/fastrtps_port{70_000 + os.getpid()}")
-    owner = port.with_name(f"{port.name}_el")
-    port.write_bytes(b"\0" * 4096)
     with contextlib.ExitStack() as stack:
-        for path in (port, owner):
-            stack.callback(path.unlink, missing_ok=True)
-        stack.enter_context(owner.open("w"))
         remove, end = stack.enter_context(holding(port))
         assert [hearing.Reach().is_lost() for _ in range(3)] == [False] * 3, "the one that is read"
         remove()
@@ -614,16 +620,10 @@ def test_it_is_found_out_that_others_write_to_a_file_that_a_port_has_replaced(
         assert not reach.is_given_up
 
 
-def test_it_is_found_out_that_an_own_port_was_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_found_out_that_an_own_port_was_replaced(port: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hearing, "_LOOKS_S", ())
     monkeypatch.setattr(hearing, "_OWN_LOOK_S", 0.0)
-    port = Path(f"/dev/shm/fastrtps_port{71_000 + os.getpid()}")
-    owner = port.with_name(f"{port.name}_el")
-    port.write_bytes(b"\0" * 4096)
     with contextlib.ExitStack() as stack:
-        for path in (port, owner):
-            stack.callback(path.unlink, missing_ok=True)
-        stack.enter_context(owner.open("w"))
         file = stack.enter_context(port.open("r+b"))
         stack.enter_context(mmap.mmap(file.fileno(), 0))
         reach = hearing.Reach()
@@ -635,7 +635,7 @@ def test_it_is_found_out_that_an_own_port_was_replaced(monkeypatch: pytest.Monke
 
 
 @pytest.mark.long
-def test_a_node_begins_anew_until_nobody_writes_to_a_file_that_its_port_has_replaced(
+def test_a_node_begins_anew_at_other_ports_where_somebody_writes_to_files_that_they_have_replaced(
     domain: int, tmp_path: Path
 ) -> None:
     with Graph({"composites": {}}, domain, tmp_path) as graph:
@@ -662,8 +662,7 @@ def test_a_node_begins_anew_until_nobody_writes_to_a_file_that_its_port_has_repl
             assert process.log.read_text().count("begins anew") == 1
             assert process.poll() is None
             assert process.pid == pid
-            owned = {Path(path.removesuffix("_el")) for path in links(pid) if path.endswith("_el")}
-            assert len({str(p) for p in owned if p.exists() and "_port" in p.name} - before) == 2
+            assert len({path for path in ports() if Path(path).exists()} - before) == 2
             assert process.log.read_text().rstrip().splitlines()[-1].split("]: ")[1].startswith("active")
 
 

@@ -1,9 +1,9 @@
 """A participant that nobody can reach at its ports in shared memory hears nobody, unsaid: it is made again.
 
-Two things leave one so. Its predecessor still holds a port's lock, and the middleware goes on without that
+Three things leave one so. Its predecessor still holds a port's lock, and the middleware goes on without that
 port (`make_hearing`). Or the predecessor was killed in its first moment, before anything listened at its
-port: the middleware makes the file anew, and whoever has the old one open never finds out, and goes on
-writing to that (`Reach`).
+port: the middleware replaces the file, and whoever has the old one open writes to that for good. Or another
+process replaces the port of one that is alive, but had no processor for long (`Reach`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from .shared_memory import bound
+from .shared_memory import bound, owned_files
 
 Made = TypeVar("Made")
 
@@ -41,18 +41,9 @@ _kept: dict[str, list[Any]] = {}
 
 def _held() -> tuple[int, set[str]]:
     """Return how many segments this process holds, and the files of its ports."""
-    segments, ports = 0, set()
-    for entry in os.listdir(_FILES):
-        try:
-            path = os.readlink(f"{_FILES}/{entry}")
-        except OSError:
-            continue  # of the listing itself
-        if path.startswith(_SHARED) and path.endswith(_OWNER):
-            if "_port" in path:
-                ports.add(path.removesuffix(_OWNER))
-            else:
-                segments += 1
-    return segments, ports
+    files = owned_files("self")
+    ports = {file for file in files if "_port" in file}
+    return len(files) - len(ports), ports
 
 
 def _replaced(ports: set[str]) -> set[str]:

@@ -53,18 +53,21 @@ def free_shared_memory() -> int:
         return 0
 
 
-def segments_of(pid: int) -> set[Path]:
-    """Return the shared memory segments of the middleware that a process owns (not its ports)."""
+def owned_files(pid: int | str) -> set[str]:
+    """Return the middleware's files in shared memory that a process owns: segments, and ports."""
     found = set()
-    try:
+    with contextlib.suppress(OSError):  # it has ended
         for entry in os.listdir(f"/proc/{pid}/fd"):
             with contextlib.suppress(OSError):
                 path = os.readlink(f"/proc/{pid}/fd/{entry}")
-                if path.startswith(_SEGMENTS) and path.endswith(_OWNER) and "_port" not in path:
-                    found.add(Path(path.removesuffix(_OWNER)))
-    except OSError:
-        pass  # it has ended
+                if path.startswith(_SEGMENTS) and path.endswith(_OWNER):
+                    found.add(path.removesuffix(_OWNER))
     return found
+
+
+def segments_of(pid: int) -> set[Path]:
+    """Return the shared memory segments of the middleware that a process owns (not its ports)."""
+    return {Path(file) for file in owned_files(pid) if "_port" not in file}
 
 
 def remove_segment(segment: Path) -> None:
