@@ -14,6 +14,8 @@ PY := $(VENV)/bin/python
 DEMO_BAG ?= bags/demo
 DEMO_OUT ?= results/demo
 PYTEST_WORKERS ?= 2
+# A test that takes so long hangs: it fails, with the stack of every thread, and the others are run.
+HANGS ?= --timeout 600 --timeout-method thread
 # More arguments of the accuracy benchmark: make accuracy ACCURACY_ARGUMENTS=--resume
 ACCURACY_ARGUMENTS ?=
 # Of the population: make population POPULATION_ARGUMENTS='--half test --scenes 500 --out FOLDER'
@@ -90,9 +92,9 @@ types: install ## mypy
 
 unit: install ## pytest alone
 	@mkdir -p $(ROS_LOG_DIR)
-	$(PY) -m pytest -n $(PYTEST_WORKERS) --dist loadgroup --ignore=test/nodes
-	$(PY) -m pytest -n $(PYTEST_WORKERS) --dist loadgroup test/nodes --ignore=test/nodes/test_processes.py
-	$(PY) -m pytest test/nodes/test_processes.py  # looks at all of the machine's shared memory: alone on it
+	$(PY) -m pytest $(HANGS) -n $(PYTEST_WORKERS) --dist loadgroup --ignore=test/nodes
+	$(PY) -m pytest $(HANGS) -n $(PYTEST_WORKERS) --dist loadgroup test/nodes --ignore=test/nodes/test_processes.py
+	$(PY) -m pytest $(HANGS) test/nodes/test_processes.py  # looks at all of the machine's shared memory: alone on it
 
 long: install ## the tests that `make test` leaves out: more of the same
 	@mkdir -p $(ROS_LOG_DIR)

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from ..core.shape.mesh import Dimensions
     from ..core.shape.result import Result
     from ..core.shape.volume import Target, VoxelGrid
+    from msg_adapters import Heartbeat
 
 #: Stages of a bag, and the nodes that turn each into the next.
 _CHAIN = {
@@ -623,8 +624,7 @@ def _until_complete(
         if beat is not None and finished and _sinks_complete(graph, watcher):
             progress(beat.counts["done"], beat.counts["total"])
             return
-        names = ("in", "sent", "done", "views")
-        changes = {k: (b.instance, *map(b.counts.get, names)) for k, b in watcher.beats.items()}
+        changes = {key: _got_through(beat) for key, beat in watcher.beats.items()}
         # At a rate the next view's time may be far off: the player says so.
         paced = any(b.values.get("due_in_s") for b in watcher.beats.values())
         if changes != state or paced:
@@ -634,6 +634,13 @@ def _until_complete(
             raise ReplayError(
                 f"nothing has happened for {stall_timeout_s:g} s; the nodes' last lines: {'; '.join(lines)}"
             )
+
+
+def _got_through(beat: Heartbeat) -> tuple[str, int, int, int]:
+    """Say what a node has done; that views are sent again and again, to somebody who hears none, is nothing."""
+    counts = beat.counts
+    first_time = counts.get("in", 0) - counts.get("duplicates", 0)
+    return beat.instance, first_time, counts.get("done", 0), counts.get("views", 0)
 
 
 def _sinks_complete(graph: Graph, watcher: _Watcher) -> bool:

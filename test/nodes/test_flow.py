@@ -392,6 +392,22 @@ def test_a_vanished_only_sink_is_waited_for_so_long_and_no_longer() -> None:
     assert not flow.waiting_for()
 
 
+def test_a_sink_that_only_fetches_what_it_missed_is_not_waited_for_once_it_vanishes() -> None:
+    flow, clock = make_flow(3, window=3, sink_wait_s=20.0)
+    carver = Consumer(flow)
+    flow.look()
+    for stamp in take_all(flow):
+        carver.report(stamp)
+    viewer = Consumer(flow, "viewer", stream="shadow")
+    viewer.beat(passing="true")
+    flow.look()
+    assert not flow.finished
+    assert set(take_all(flow)) == {1, 2, 3}, "as long as it is there it gets what it lacks"
+    wait(flow, clock, 4.0, carver)
+    assert flow.finished
+    assert not flow.waiting_for()
+
+
 def test_a_source_that_was_busy_itself_does_not_take_its_consumers_for_gone() -> None:
     flow, clock = make_flow(3)
     Consumer(flow)

@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import mmap
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -40,8 +41,9 @@ from csas_shadow_ros.graph.processes import (
 )
 from csas_shadow_ros.graph.replay import replay
 from csas_shadow_ros.nodes.runtime import hearing
-from csas_shadow_ros.nodes.runtime.shared_memory import segments_of
+from csas_shadow_ros.nodes.runtime.shared_memory import owned_files, segments_of
 from csas_shadow_ros.simulation import SimulatedRun
+from msg_adapters import Heartbeat
 
 Reference = tuple[Result, list[ProcessedView]]
 
@@ -634,8 +636,65 @@ def test_it_is_found_out_that_an_own_port_was_replaced(port: Path, monkeypatch: 
         assert reach.is_given_up
 
 
+def test_views_that_are_sent_again_and_again_are_no_progress_of_a_replay() -> None:
+    def at(**counts: int) -> tuple[str, int, int, int]:
+        return module._got_through(Heartbeat(0, "sub_aperture", "s-1", "source", counts))
+
+    before = at(done=3, sent=9, resends=5, **{"in": 4}, duplicates=2)
+    assert at(done=3, sent=13, resends=9, **{"in": 8}, duplicates=6) == before
+    assert at(done=4, sent=9, resends=5, **{"in": 4}, duplicates=2) != before
+    assert at(done=3, sent=9, resends=5, **{"in": 5}, duplicates=2) != before
+
+
+def test_the_port_of_a_killed_process_is_avoided_as_long_as_others_write_to_it(port: Path) -> None:
+    owner = port.with_name(f"{port.name}_el")
+    with holding(port) as (_, end):
+        with owner.open("rb") as alive:
+            fcntl.flock(alive, fcntl.LOCK_EX)
+            with hearing.avoid_dead_ports() as avoided:
+                assert str(port) not in avoided, "it has a reader"
+        with owner.open("rb") as another:
+            with hearing.avoid_dead_ports() as avoided:
+                assert str(port) in avoided
+                with pytest.raises(BlockingIOError):
+                    fcntl.flock(another, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(another, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        end()
+        with hearing.avoid_dead_ports() as avoided:
+            assert str(port) not in avoided, "nobody writes to it"
+
+
+def test_a_successor_takes_other_ports_than_the_killed_node_that_others_still_write_to(
+    domain: int, tmp_path: Path
+) -> None:
+    plan: dict[str, dict[str, Any]] = {"composites": {}, "shadow_likelihood": {}}
+    with Graph(plan, domain, tmp_path) as graph:
+        process = graph.processes["composites"]
+
+        def ports() -> set[str]:
+            return {os.path.basename(path) for path in owned_files(process.pid) if "_port" in path}
+
+        def written() -> set[str]:
+            maps = Path(f"/proc/{graph.processes['shadow_likelihood'].pid}/maps").read_text()
+            return set(re.findall(r"fastrtps_port\d+", maps))
+
+        deadline = time.monotonic() + 120
+        while len(before := ports()) != 2 or not before <= written():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        pid = process.pid
+        os.kill(pid, signal.SIGKILL)
+        told = process.log.read_text().count(": active")
+        while process.pid == pid or process.log.read_text().count(": active") == told:
+            assert time.monotonic() < deadline
+            graph.watch()
+            time.sleep(0.05)
+        assert len(ports() - before) == 2
+        assert not ports() & before
+
+
 @pytest.mark.long
-def test_a_node_begins_anew_at_other_ports_where_somebody_writes_to_files_that_they_have_replaced(
+def test_a_node_whose_ports_were_replaced_begins_anew_at_other_ports(
     domain: int, tmp_path: Path
 ) -> None:
     with Graph({"composites": {}}, domain, tmp_path) as graph:
@@ -650,14 +709,13 @@ def test_a_node_begins_anew_at_other_ports_where_somebody_writes_to_files_that_t
             assert time.monotonic() < deadline
             time.sleep(0.05)
         before = set(ports())
+        pid = process.pid
         with holding(*before) as (remove, _):  # for good
-            os.kill(process.pid, signal.SIGKILL)
             remove()
             while "begins anew" not in process.log.read_text():
                 assert time.monotonic() < deadline
                 graph.watch()
                 time.sleep(0.05)
-            pid = process.pid
             time.sleep(15.0)
             assert process.log.read_text().count("begins anew") == 1
             assert process.poll() is None

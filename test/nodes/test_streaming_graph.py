@@ -80,18 +80,23 @@ def complete(nodes: dict[str, Any]) -> Callable[[], bool]:
 def test_views_come_while_sectors_do_and_the_grid_is_that_of_the_whole_run(
     graph: Graph, sector_bag: Path, reference_of_sectors: Result
 ) -> None:
-    nodes = streaming_graph(graph, sector_bag, 60.0, **given(reference_of_sectors))
+    nodes = streaming_graph(graph, sector_bag, 30.0, **given(reference_of_sectors))
     viewer, seen = graph.plain_node("viewer"), []
     messages = RclpyMessages()
     marker = messages.cls("visualization_msgs/msg/Marker")
-    viewer.create_subscription(marker, "mesh", seen.append, qos.LATCHED)
+
+    def see(mesh: Any) -> None:
+        if mesh.points and not nodes["carver"].growing.complete:
+            seen.append((nodes["carver"].state_counts()["arc_deg"], set(nodes["carver"].state_values())))
+
+    viewer.create_subscription(marker, "mesh", see, qos.LATCHED)
     graph.spin_until(lambda: nodes["carver"].state_counts()["views"] >= 6)
     assert nodes["sub_aperture"].state_counts()["sectors"] < 24, "the sonar still goes round"
-    graph.spin_until(lambda: len(seen) > 1)
-    assert not nodes["carver"].growing.complete
-    assert {"run", "verdict", "length_m", "width_m", "height_m"} <= set(nodes["carver"].state_values())
-    assert 0 < nodes["carver"].state_counts()["arc_deg"] < 360
     graph.spin_until(complete(nodes), 60.0)
+    # How many shapes come depends on what one takes; of an unfinished circle one comes at least.
+    arcs = [arc for arc, _ in seen]
+    assert any(0 < arc < 360 for arc in arcs), arcs
+    assert {"run", "verdict", "length_m", "width_m", "height_m"} <= set.union(*(told for _, told in seen))
     assert_same_grid(nodes["carver"], reference_of_sectors)
     assert nodes["sub_aperture"].state_counts()["arc_deg"] == 360
     assert nodes["sub_aperture"].state_counts()["revision"] == 0

@@ -61,6 +61,8 @@ class Peer:
     unable: str = ""
     #: It has said goodbye: a report that was overtaken by that does not bring it back, a heartbeat does.
     left: bool = False
+    #: It only fetches what it has missed: if it vanishes, its successor asks anew.
+    passing: bool = False
 
     @property
     def key(self) -> str:
@@ -197,6 +199,7 @@ class Flow:
         peer = self.peers.setdefault(item.instance, Peer(item.instance, item.node, role, stream, now, False))
         if isinstance(item, Heartbeat):
             self._is_unable(peer, item.values.get("unable", ""))
+        peer.passing = item.values.get("passing") == "true"
         there = not leaving and not idle and not peer.unable
         peer.left = leaving or (peer.left and isinstance(item, ViewProgress))
         if isinstance(item, ViewProgress) and (idle or peer.left):
@@ -328,7 +331,7 @@ class Flow:
         for peer in self.peers.values():
             if peer.alive and now - peer.heard_s > self.peer_timeout_s:
                 peer.alive = False
-                if peer.role == "sink" and not self._twin_alive(peer):
+                if peer.role == "sink" and not peer.passing and not self._twin_alive(peer):
                     self._gone[peer.node, peer.stream] = now
                     self.notes.append(
                         ("warn", f"{peer.node} has been silent for {self.peer_timeout_s:g} s: waiting for it")

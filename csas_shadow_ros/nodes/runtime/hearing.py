@@ -1,9 +1,14 @@
-"""A participant that nobody can reach at its ports in shared memory hears nobody, unsaid: it is made again.
+"""A participant that nobody can reach at its ports in shared memory hears nobody, unsaid.
 
-Three things leave one so. Its predecessor still holds a port's lock, and the middleware goes on without that
-port (`make_hearing`). Or the predecessor was killed in its first moment, before anything listened at its
-port: the middleware replaces the file, and whoever has the old one open writes to that for good. Or another
-process replaces the port of one that is alive, but had no processor for long (`Reach`).
+Three things leave one so:
+
+- It takes the port of a process that was killed. The middleware replaces the port's file, and whoever has the
+  old one open writes to that: for one or two times `healthy_check_timeout_ms`, or for good where the killed
+  process had not begun to listen. Such a port is not taken (`avoid_dead_ports`).
+- Another process still holds a port's lock, and the middleware goes on without that port: the participant is
+  made again (`make_hearing`).
+- Another process replaces the port of one that is alive, but had no processor for long. `Reach` looks for it,
+  as for what two processes that begin at once do to one another; the node begins anew at other ports.
 """
 
 from __future__ import annotations
@@ -15,9 +20,9 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 from .shared_memory import bound, owned_files
 
@@ -26,15 +31,17 @@ Made = TypeVar("Made")
 #: The middleware's files in shared memory that this process holds locked: a segment's, and its ports'.
 _SHARED, _OWNER = "/dev/shm/fastrtps_", "_el"
 _FILES = "/proc/self/fd"
-#: A file that is open and has another in its place, as the kernel tells of it.
+#: A port's file; one that is open and has another in its place, as the kernel tells of it.
+_PORT = re.compile(rf"{_SHARED}port\d+")
 _DELETED = re.compile(rf"({_SHARED}port\d+) \(deleted\)")
 #: A participant listens at two ports: what it discovers comes by the one, all else by the other.
 _PORTS = 2
 #: A process that is killed lets go of its ports within milliseconds, on a busy one within seconds.
 _PATIENCE_S, _AGAIN_S = 10.0, 0.2
-#: When (s after a start) to look for older files of its ports that others have open, and how often (s) to
-#: look whether its own are still those that others find.
-_LOOKS_S, _OWN_LOOK_S = (5.0, 8.0), 5.0
+#: When (s after a start) to look for older files of its ports that others have open: they let go of them
+#: within twice `healthy_check_timeout_ms` and a second. How often (s) to look whether its own are still those
+#: that others find.
+_LOOKS_S, _OWN_LOOK_S = (8.0, 11.0), 5.0
 #: What keeps ports from this process' next participant, for as long as the process lives: port → its holders.
 _kept: dict[str, list[Any]] = {}
 
@@ -64,10 +71,9 @@ def _deleted(maps: Path) -> set[str]:
 class Reach:
     """Whether others reach this process at the ports that it has made.
 
-    A file that is replaced is let go of within 3 s as a rule, when the middleware finds that nobody reads it.
-    It is looked for twice, later than that. Another process may also replace the port of one that is alive
-    but has had no processor for as long as the middleware waits for a sign of it
-    (`healthy_check_timeout_ms`).
+    A file that is replaced is let go of when the middleware finds that nobody reads it. It is looked for
+    twice, later than that. Another process may also replace the port of one that is alive but has had no
+    processor for as long as the middleware waits for a sign of it (`healthy_check_timeout_ms`).
     """
 
     def __init__(self) -> None:
@@ -109,8 +115,46 @@ class Reach:
                 fcntl.flock(holders[-1], fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
+def _locked(port: str) -> IO[bytes] | None:
+    """Lock a port as its reader does; None if it has a reader, or is another user's."""
+    with contextlib.ExitStack() as stack, contextlib.suppress(OSError):
+        lock = stack.enter_context(Path(port + _OWNER).open("r+b"))
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        stack.pop_all()
+        return lock
+    return None
+
+
+@contextlib.contextmanager
+def avoid_dead_ports() -> Iterator[list[str]]:
+    """Keep this process from the ports of killed processes that others still write to, for a moment.
+
+    Yields
+    ------
+    list of str
+        Their files.
+    """
+    with contextlib.ExitStack() as stack:
+        dead = {}
+        for owner in Path(_SHARED).parent.glob(f"{Path(_SHARED).name}port*{_OWNER}"):
+            port = str(owner).removesuffix(_OWNER)
+            if (lock := _locked(port)) is not None:
+                dead[port] = stack.enter_context(lock)
+        written: set[str] = set()
+        for other in Path("/proc").glob("[0-9]*/maps") if dead else ():
+            with contextlib.suppress(OSError):  # of another user, or gone meanwhile
+                written.update(_PORT.findall(other.read_text(errors="replace")))
+        for port in dead.keys() - written:
+            dead.pop(port).close()
+        for port in dead:
+            # Participants are numbered by the first of their UDP ports that is free, which is even.
+            if (holder := bound(int(port.rpartition("_port")[2]) & ~1)) is not None:
+                stack.enter_context(holder)
+        yield sorted(dead)
+
+
 def make_hearing(make: Callable[[], Made], take_back: Callable[[Made], None]) -> Made:
-    """Make an object with its own participant, again if that lacks its ports.
+    """Make an object with its own participant, at ports that nobody else has; again if it lacks them.
 
     Two processes that are killed at once do not let go of all they hold at once. A third that begins just
     then may find one's socket free and its lock taken; the middleware goes on without that port, and others
@@ -133,7 +177,8 @@ def make_hearing(make: Callable[[], Made], take_back: Callable[[Made], None]) ->
     end = time.monotonic() + _PATIENCE_S
     while True:
         segments_before, ports_before = _held()
-        made = make()
+        with avoid_dead_ports():
+            made = make()
         segments, ports = _held()
         # Without shared memory there is nothing to miss.
         if segments <= segments_before or len(ports - ports_before) >= _PORTS:

@@ -24,11 +24,11 @@ def ports_of(domain_id: int) -> range:
 
 
 def bound(port: int) -> socket.socket | None:
-    """Bind a UDP port exclusively on all addresses; None if it is taken."""
+    """Bind a UDP port exclusively on all addresses; None if it is taken, or there is no such port."""
     made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         made.bind(("", port))
-    except OSError:
+    except (OSError, OverflowError):
         made.close()
         return None
     return made
