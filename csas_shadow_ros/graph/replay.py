@@ -35,12 +35,13 @@ if TYPE_CHECKING:
     import trimesh
     from numpy.typing import NDArray
 
+    from msg_adapters import Heartbeat
+
     from ..core.geometry import GroundGrid
     from ..core.search.decision import Decision
     from ..core.shape.mesh import Dimensions
     from ..core.shape.result import Result
     from ..core.shape.volume import Target, VoxelGrid
-    from msg_adapters import Heartbeat
 
 #: Stages of a bag, and the nodes that turn each into the next.
 _CHAIN = {
@@ -637,7 +638,7 @@ def _until_complete(
 
 
 def _got_through(beat: Heartbeat) -> tuple[str, int, int, int]:
-    """Say what a node has done; that views are sent again and again, to somebody who hears none, is nothing."""
+    """Say what a node has done; views that are sent again, to somebody who hears none, are nothing."""
     counts = beat.counts
     first_time = counts.get("in", 0) - counts.get("duplicates", 0)
     return beat.instance, first_time, counts.get("done", 0), counts.get("views", 0)
