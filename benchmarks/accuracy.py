@@ -630,77 +630,100 @@ def intervals_hold(row: Row, quantities: Sequence[str] = SIZES) -> list[bool]:
     return [given[n][0] <= row.true_size[n] <= given[n][1] for n in quantities if n in given]
 
 
+def _line(wanted: str, values: Sequence[float | bool], measured: Callable[[], str], met: bool) -> Line:
+    return Line(wanted, measured() if values else "not measured", met if values else None)
+
+
 def acceptance(rows: Sequence[Row], voxel_size_m: float) -> list[Line]:
     """Compare the rows with what is asked of the default method."""
-    lines: list[Line] = []
     clean = _of(rows, CLEAN)
+    empty = [not r.found for r in rows if r.case.target == EMPTY]
+    return [
+        *_asked_of_shapes(clean),
+        *_asked_of_sizes(clean, voxel_size_m),
+        *_asked_of_conditions(rows, clean),
+        _line(
+            "empty seabeds that give no object: all",
+            empty,
+            lambda: f"{sum(empty)} of {len(empty)}",
+            all(empty),
+        ),
+    ]
 
-    def add(wanted: str, values: Sequence[float | bool], measured: Callable[[], str], met: bool) -> None:
-        lines.append(Line(wanted, measured() if values else "not measured", met if values else None))
 
+def _asked_of_shapes(clean: Sequence[Row]) -> list[Line]:
     scores = [_iou(r) for r in clean]
     targets = len({r.case.target for r in clean})
     mean = _mean(scores)
-    add(
-        f"mean IoU with the hull, clean, at least {LEAST_MEAN_IOU:.2f}",
-        scores,
-        lambda: f"{mean:.3f} ({targets} targets, {len(clean)} cases)",
-        mean >= LEAST_MEAN_IOU,
-    )
     lowest = min(clean, key=_iou, default=None)
-    add(
-        f"lowest IoU with the hull, clean, at least {LEAST_IOU:.2f}",
-        scores,
-        lambda: f"{_iou(lowest):.3f} ({lowest.case.target}, seed {lowest.case.seed})" if lowest else "",
-        min(scores, default=0.0) >= LEAST_IOU,
-    )
+    lines = [
+        _line(
+            f"mean IoU with the hull, clean, at least {LEAST_MEAN_IOU:.2f}",
+            scores,
+            lambda: f"{mean:.3f} ({targets} targets, {len(clean)} cases)",
+            mean >= LEAST_MEAN_IOU,
+        ),
+        _line(
+            f"lowest IoU with the hull, clean, at least {LEAST_IOU:.2f}",
+            scores,
+            lambda: f"{_iou(lowest):.3f} ({lowest.case.target}, seed {lowest.case.seed})" if lowest else "",
+            min(scores, default=0.0) >= LEAST_IOU,
+        ),
+    ]
     for target in RING_AND_FRAME:
         own = [_iou(r, against="truth") for r in clean if r.case.target == target]
-        add(
-            f"IoU of the {target} with the truth, clean, at least {LEAST_IOU_TRUTH:.2f}",
-            own,
-            lambda own=own: f"lowest {min(own):.3f}, mean {_mean(own):.3f}",  # type: ignore[misc]
-            min(own, default=0.0) >= LEAST_IOU_TRUTH,
+        lines.append(
+            _line(
+                f"IoU of the {target} with the truth, clean, at least {LEAST_IOU_TRUTH:.2f}",
+                own,
+                lambda own=own: f"lowest {min(own):.3f}, mean {_mean(own):.3f}",  # type: ignore[misc]
+                min(own, default=0.0) >= LEAST_IOU_TRUTH,
+            )
         )
+    return lines
+
+
+def _asked_of_sizes(clean: Sequence[Row], voxel_size_m: float) -> list[Line]:
     within = [ok for r in clean for ok in sizes_within(r, voxel_size_m)]
-    add(
-        f"length, width and height, clean, within {_percent(SIZE_TOLERANCE)} or one voxel"
-        f" ({voxel_size_m * 100:g} cm), whichever is larger: at least {_percent(LEAST_SIZE_SHARE)}",
-        within,
-        lambda: f"{_percent(_mean(within))} ({sum(within)} of {len(within)})",
-        _mean(within) >= LEAST_SIZE_SHARE,
-    )
     held = [ok for r in clean for ok in intervals_hold(r)]
-    add(
-        "95 % intervals of length, width and height, clean, contain the truth: at least"
-        f" {_percent(LEAST_COVERAGE)}",
-        held,
-        lambda: f"{_percent(_mean(held))} ({sum(held)} of {len(held)})",
-        _mean(held) >= LEAST_COVERAGE,
-    )
+    return [
+        _line(
+            f"length, width and height, clean, within {_percent(SIZE_TOLERANCE)} or one voxel"
+            f" ({voxel_size_m * 100:g} cm), whichever is larger: at least {_percent(LEAST_SIZE_SHARE)}",
+            within,
+            lambda: f"{_percent(_mean(within))} ({sum(within)} of {len(within)})",
+            _mean(within) >= LEAST_SIZE_SHARE,
+        ),
+        _line(
+            "95 % intervals of length, width and height, clean, contain the truth: at least"
+            f" {_percent(LEAST_COVERAGE)}",
+            held,
+            lambda: f"{_percent(_mean(held))} ({sum(held)} of {len(held)})",
+            _mean(held) >= LEAST_COVERAGE,
+        ),
+    ]
+
+
+def _asked_of_conditions(rows: Sequence[Row], clean: Sequence[Row]) -> list[Line]:
+    before = {(r.case.target, r.case.seed): _iou(r) for r in clean}
+    lines = []
     for condition in CONDITIONS:
         if condition == CLEAN:
             continue
-        before = {(r.case.target, r.case.seed): _iou(r) for r in clean}
         pairs = [
             (before[key], _iou(r))
             for r in _of(rows, condition)
             if (key := (r.case.target, r.case.seed)) in before
         ]
         loss = _mean(a - b for a, b in pairs)
-        add(
-            f"mean IoU lost by {CONDITION_TEXT[condition]}, at most {MOST_LOSS:.2f}",
-            [a for a, _ in pairs],
-            lambda loss=loss, pairs=pairs: f"{loss:.3f} (to {_mean(b for _, b in pairs):.3f})",  # type: ignore[misc]
-            loss <= MOST_LOSS,
+        lines.append(
+            _line(
+                f"mean IoU lost by {CONDITION_TEXT[condition]}, at most {MOST_LOSS:.2f}",
+                [a for a, _ in pairs],
+                lambda loss=loss, pairs=pairs: f"{loss:.3f} (to {_mean(b for _, b in pairs):.3f})",  # type: ignore[misc]
+                loss <= MOST_LOSS,
+            )
         )
-    empty = [not r.found for r in rows if r.case.target == EMPTY]
-    add(
-        "empty seabeds that give no object: all",
-        empty,
-        lambda: f"{sum(empty)} of {len(empty)}",
-        all(empty),
-    )
     return lines
 
 

@@ -73,77 +73,88 @@ def half_width_share(row: Row, body: BodyScore, name: str) -> float:
     return 0.5 * (high - low) / max(HALF_WIDTH * body.true_size[name], row.voxel_m)
 
 
+def _line(wanted: str, values: Sequence[Any], measured: str, met: bool) -> Line:
+    return Line(wanted, measured if values else "not measured", met if values else None)
+
+
 def acceptance(rows: Sequence[Row]) -> list[Line]:
     """Compare the rows with what is asked."""
-    lines: list[Line] = []
-
-    def add(wanted: str, values: Sequence[Any], measured: str, met: bool) -> None:
-        lines.append(Line(wanted, measured if values else "not measured", met if values else None))
-
+    where = "where it is required*"
     asked = bodies_of(rows, asked=True)
+    missed = [not b.found for _, b in asked]
+    silent = [r.wrong() and not r.flagged for r in rows if r.bodies]
+    return [
+        *_asked_of_shapes(asked, where),
+        *_asked_of_intervals(asked),
+        _asked_of_empty_seabeds([r for r in rows if not r.bodies]),
+        _line(
+            f"objects missed, {where}: ≤ {_percent(MOST_MISSED)}",
+            missed,
+            _of(missed),
+            _share(missed) <= MOST_MISSED,
+        ),
+        _line(
+            "scenes with an extent off by more than its interval (and by more than 5 % and one voxel) without"
+            f" a flag: ≤ {_percent(MOST_UNFLAGGED)}",
+            silent,
+            _of(silent),
+            _share(silent) <= MOST_UNFLAGGED,
+        ),
+    ]
+
+
+def _asked_of_shapes(asked: Sequence[tuple[Row, BodyScore]], where: str) -> list[Line]:
     ious = [b.iou_hull for _, b in asked]
     middle, tenth = _quantile(ious, 0.5), _quantile(ious, 0.1)
-    where = "where it is required*"
-    add(
-        f"IoU with the shadow hull, {where}: median ≥ {MEDIAN_IOU:.2f}",
-        ious,
-        f"{middle:.3f} ({len(ious)} bodies)",
-        middle >= MEDIAN_IOU,
-    )
-    add(f"the same, tenth percentile ≥ {TENTH_IOU:.2f}", ious, f"{tenth:.3f}", tenth >= TENTH_IOU)
     within = [b.within(n, r.voxel_m) for r, b in asked for n in SIZES]
-    add(
-        f"length, width, height within 5 % or one voxel, {where}: ≥ {_percent(SIZE_SHARE)}",
-        within,
-        _of(within),
-        _share(within) >= SIZE_SHARE,
-    )
+    return [
+        _line(
+            f"IoU with the shadow hull, {where}: median ≥ {MEDIAN_IOU:.2f}",
+            ious,
+            f"{middle:.3f} ({len(ious)} bodies)",
+            middle >= MEDIAN_IOU,
+        ),
+        _line(f"the same, tenth percentile ≥ {TENTH_IOU:.2f}", ious, f"{tenth:.3f}", tenth >= TENTH_IOU),
+        _line(
+            f"length, width, height within 5 % or one voxel, {where}: ≥ {_percent(SIZE_SHARE)}",
+            within,
+            _of(within),
+            _share(within) >= SIZE_SHARE,
+        ),
+    ]
+
+
+def _asked_of_intervals(asked: Sequence[tuple[Row, BodyScore]]) -> list[Line]:
     held = [h for r, b in asked for n in SIZES if (h := b.holds(n)) is not None]
     low, high = COVERAGE
-    add(
-        f"95 % intervals contain the truth: {100 * low:.0f} to {100 * high:.0f} %",
-        held,
-        _of(held),
-        low <= _share(held) <= high,
-    )
-    widths = [half_width_share(r, b, n) for r, b in asked for n in SIZES if n in b.intervals]
-    relative = [
-        0.5 * (b.intervals[n][1] - b.intervals[n][0]) / b.true_size[n]
-        for r, b in asked
-        for n in SIZES
-        if n in b.intervals
-    ]
+    measured = [(r, b, n) for r, b in asked for n in SIZES if n in b.intervals]
+    widths = [half_width_share(r, b, n) for r, b, n in measured]
+    relative = [0.5 * (b.intervals[n][1] - b.intervals[n][0]) / b.true_size[n] for _, b, n in measured]
     width = _quantile(widths, 0.5)
-    add(
-        f"their median half-width ≤ {_percent(HALF_WIDTH)} or one voxel",
-        widths,
-        f"{width:.2f} of that; {100 * _quantile(relative, 0.5):.1f} % of the extent",
-        width <= 1.0,
-    )
-    empty = [r for r in rows if not r.bodies]
+    return [
+        _line(
+            f"95 % intervals contain the truth: {100 * low:.0f} to {100 * high:.0f} %",
+            held,
+            _of(held),
+            low <= _share(held) <= high,
+        ),
+        _line(
+            f"their median half-width ≤ {_percent(HALF_WIDTH)} or one voxel",
+            widths,
+            f"{width:.2f} of that; {100 * _quantile(relative, 0.5):.1f} % of the extent",
+            width <= 1.0,
+        ),
+    ]
+
+
+def _asked_of_empty_seabeds(empty: Sequence[Row]) -> Line:
     phantoms = [r for r in empty if r.objects]
-    add(
+    return _line(
         f"seabeds without objects on which one is found: ≤ {MOST_PHANTOMS} of 200, flagged",
         empty,
         f"{len(phantoms)} of {len(empty)}, {sum(r.flagged for r in phantoms)} flagged",
         len(phantoms) <= MOST_PHANTOMS * len(empty) / 200.0 and all(r.flagged for r in phantoms),
     )
-    missed = [not b.found for _, b in asked]
-    add(
-        f"objects missed, {where}: ≤ {_percent(MOST_MISSED)}",
-        missed,
-        _of(missed),
-        _share(missed) <= MOST_MISSED,
-    )
-    silent = [r.wrong() and not r.flagged for r in rows if r.bodies]
-    add(
-        "scenes with an extent off by more than its interval (and by more than 5 % and one voxel) without a"
-        f" flag: ≤ {_percent(MOST_UNFLAGGED)}",
-        silent,
-        _of(silent),
-        _share(silent) <= MOST_UNFLAGGED,
-    )
-    return lines
 
 
 def _group_row(name: str, pairs: Sequence[tuple[Row, BodyScore]]) -> str:

@@ -9,6 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.shape.mesh import measure
@@ -632,6 +633,37 @@ def _draw_bodies(
     return tuple(bodies), tuple(clutter)
 
 
+def _draw_view(
+    rng: Rng, body: Body, bounds: NDArray[np.float64], grazing: float, bandwidth: float
+) -> tuple[float, float, float, float]:
+    """Draw the circle's radius (m), grazing (deg), half side of the image and spacing of its pixels (m).
+
+    10 to 40 cells along the body and at least two across it, as far as the image may have pixels for it; what
+    is too thin for its long shadow then is seen from higher up.
+    """
+    size = body.size_m
+    top = float(bounds[:, 1, 2].max())
+    radius = max(_log_uniform(rng, 20.0, 150.0), 8.0 * size, 4.0 * top / math.tan(math.radians(grazing)))
+    corners = np.abs(bounds[:, :, :2]).max(axis=1)
+
+    def needed_m(grazing_deg: float) -> float:
+        """Return half of the side that bodies and shadows need."""
+        sonar = radius * math.tan(math.radians(grazing_deg))
+        return max(
+            math.hypot(*corner) + shadow_length_m(b[1, 2], radius + size, sonar)
+            for corner, b in zip(corners, bounds, strict=True)
+        )
+
+    cell = size / _log_uniform(rng, 10.0, 40.0)
+    across = measure(body.mesh()).width_m / LEAST_CELLS
+    cell = min(cell, across)
+    spacing = cell / _cell_m(1.0, bandwidth)
+    coarsest = across / _cell_m(1.0, bandwidth)
+    while 2.0 * needed_m(grazing) > (MOST_PIXELS - 64) * coarsest and grazing < 35.0:
+        grazing = min(grazing + 1.0, 35.0)
+    return radius, grazing, needed_m(grazing) + 3.0 * cell, spacing
+
+
 def _draw_run(
     rng: Rng,
     half: str,
@@ -645,29 +677,7 @@ def _draw_run(
     if bodies:
         size = bodies[0].size_m
         bounds = np.array([body.mesh().bounds for body in (*bodies, *clutter)])
-        top = float(bounds[:, 1, 2].max())
-        radius = max(_log_uniform(rng, 20.0, 150.0), 8.0 * size, 4.0 * top / math.tan(math.radians(grazing)))
-        corners = np.abs(bounds[:, :, :2]).max(axis=1)
-
-        def needed_m(grazing_deg: float) -> float:
-            """Return half of the side that bodies and shadows need."""
-            sonar = radius * math.tan(math.radians(grazing_deg))
-            return max(
-                math.hypot(*corner) + shadow_length_m(b[1, 2], radius + size, sonar)
-                for corner, b in zip(corners, bounds, strict=True)
-            )
-
-        # 10 to 40 cells along the body and at least two across it, as far as the image may have pixels for
-        # it; what is too thin for its long shadow then is seen from higher up.
-        cell = size / _log_uniform(rng, 10.0, 40.0)
-        across = measure(bodies[0].mesh()).width_m / LEAST_CELLS
-        cell = min(cell, across)
-        spacing = cell / _cell_m(1.0, bandwidth)
-        coarsest = across / _cell_m(1.0, bandwidth)
-        while 2.0 * needed_m(grazing) > (MOST_PIXELS - 64) * coarsest and grazing < 35.0:
-            grazing = min(grazing + 1.0, 35.0)
-        half_side = needed_m(grazing)
-        half_side += 3.0 * cell
+        radius, grazing, half_side, spacing = _draw_view(rng, bodies[0], bounds, grazing, bandwidth)
         if "cropped" in complications:
             half_side *= _uniform(rng, 0.45, 0.8)
     else:
@@ -675,7 +685,6 @@ def _draw_run(
         radius = max(_log_uniform(rng, 20.0, 150.0), 12.0 * size)
         half_side = _uniform(rng, 1.5, 3.0) * size
         spacing = 2.0 * half_side / 704.0
-        top = 0.0
     pixels = int(np.clip(64 * math.ceil(2.0 * half_side / spacing / 64.0), 448, MOST_PIXELS))
     spacing = 2.0 * half_side / pixels
     cell = _cell_m(spacing, bandwidth)

@@ -23,7 +23,7 @@ import platform
 import sys
 import tempfile
 import time
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -81,86 +81,99 @@ def completed_by(bag: Path, parameters: PipelineParameters) -> dict[int, list[in
     return found
 
 
+@dataclass
+class Seen:
+    """What was seen of a graph: times (s, monotonic) of sectors and grids by stamp, and what it took."""
+
+    arrived: dict[int, float] = field(default_factory=dict)
+    grids: list[tuple[float, int]] = field(default_factory=list)
+    ended_s: float = 0.0
+    most_gib: float = 0.0
+    busy_s: dict[str, float] = field(default_factory=dict)
+    cpu_s: dict[str, float] = field(default_factory=dict)
+
+
 def play(bag: Path, parameters: PipelineParameters, rate: float, publish_hz: float) -> dict[str, Any]:
     """Play a bag of sectors through the graph; return what was measured."""
-    from msg_adapters import stamp_to_ns
-
     expected = completed_by(bag, parameters)
     plan = node_parameters(parameters)
     plan["voxel_carver"]["publish_hz"] = publish_hz
     plan["sub_aperture"]["min_sinks"] = 1
     plan["bag_player"] = {"bag": str(bag), "stage": "sector", "rate": rate, "min_sinks": 1}
-    arrived: dict[int, float] = {}
-    grids: list[tuple[float, int]] = []
-    reserved = DomainReservation()
-    domain = reserved.domain_id
-
-    def take(into: Any, message: Any) -> None:
-        stamp = stamp_to_ns(message.header.stamp)
-        if into is arrived:
-            arrived.setdefault(stamp, time.monotonic())
-        else:
-            grids.append((time.monotonic(), stamp))
-
-    with tempfile.TemporaryDirectory() as log, Graph(plan, domain, Path(log)) as graph:
-        watcher = _Watcher(graph, domain)
-        try:
-            watcher._subscribe("sector/camera_info", watcher._qos.VIEWS, partial(take, arrived))
-            watcher._subscribe("voxel_grid/image", watcher._qos.LATCHED, partial(take, grids))
-            began = time.monotonic()
-            looked, most_gib = began, 0.0
-            while time.monotonic() - began < 900.0:
-                watcher.spin(0.01)  # no coarser than what is measured
-                graph.watch()
-                if time.monotonic() - looked > 2.0:
-                    looked = time.monotonic()
-                    nodes = [process.pid for process in graph.processes.values()]
-                    most_gib = max(most_gib, sum(map(proportional_kib, nodes)) / 2**20)
-                beat = watcher.beats.get(("voxel_carver", "shadow_mask"))
-                if beat is not None and beat.counts.get("complete"):
-                    break
-            ended = time.monotonic()
-            watcher.spin(0.5)
-            cpu_s = {name: cpu_seconds(process.pid) for name, process in graph.processes.items()}
-            if graph.deaths or watcher.errors:
-                raise SystemExit(f"the graph failed: {graph.deaths} {watcher.errors}")
-            busy = {
-                node: beat.counts["busy_ms"] / 1e3
-                for (node, _), beat in watcher.beats.items()
-                if "busy_ms" in beat.counts
-            }
-        finally:
-            watcher.close()
-            reserved.close()
-    order = sorted(arrived)
+    with (
+        DomainReservation() as domain,
+        tempfile.TemporaryDirectory() as log,
+        Graph(plan, domain, Path(log)) as graph,
+    ):
+        seen = watch(graph, domain)
+    order = sorted(seen.arrived)
     delays = []
     for sector in order:
         if due := expected[sector]:
-            last = max(due)
-            got = [when for when, stamp in grids if stamp >= last and when >= arrived[sector]]
-            delays.append((got[0] if got else math.inf) - arrived[sector])
+            came = seen.arrived[sector]
+            got = [when for when, stamp in seen.grids if stamp >= max(due) and when >= came]
+            delays.append((got[0] if got else math.inf) - came)
     # When the recording says against when the sector really came: a graph that lags holds the player back.
-    times = _times(bag)
-    first = order[0]
-    lag = [arrived[s] - arrived[first] - (times[s] - times[first]) / 1e9 / rate for s in order]
+    times, first = _times(bag), order[0]
+    lag = [seen.arrived[s] - seen.arrived[first] - (times[s] - times[first]) / 1e9 / rate for s in order]
     return {
         "rate": rate,
         "sectors": len(order),
-        "grids": len(grids),
+        "grids": len(seen.grids),
         "delays_s": [round(d, 4) for d in delays],
         "median_s": float(np.median(delays)),
         "p95_s": float(np.percentile(delays, 95)),
         "worst_s": float(np.max(delays)),
         "last_lag_s": float(lag[-1]),
         "worst_lag_s": float(np.max(lag)),
-        "final_grid_after_s": ended - arrived[order[-1]],
-        "busy_s": busy,
-        "most_gib": most_gib,
-        "cpu_s": cpu_s,
+        "final_grid_after_s": seen.ended_s - seen.arrived[order[-1]],
+        "busy_s": seen.busy_s,
+        "most_gib": seen.most_gib,
+        "cpu_s": seen.cpu_s,
         "recorded_s": (times[order[-1]] - times[first]) / 1e9,
         "largest_message_mib": max(_sizes(bag)) / 2**20,
         "sector_bytes": sum(_sizes(bag)),
     }
+
+
+def watch(graph: Graph, domain: int) -> Seen:
+    """Watch a graph until its grid is complete."""
+    from msg_adapters import stamp_to_ns
+
+    seen = Seen()
+
+    def take_sector(message: Any) -> None:
+        seen.arrived.setdefault(stamp_to_ns(message.header.stamp), time.monotonic())
+
+    def take_grid(message: Any) -> None:
+        seen.grids.append((time.monotonic(), stamp_to_ns(message.header.stamp)))
+
+    watcher = _Watcher(graph, domain)
+    try:
+        watcher._subscribe("sector/camera_info", watcher._qos.VIEWS, take_sector)
+        watcher._subscribe("voxel_grid/image", watcher._qos.LATCHED, take_grid)
+        began = looked = time.monotonic()
+        while time.monotonic() - began < 900.0:
+            watcher.spin(0.01)  # no coarser than what is measured
+            graph.watch()
+            if time.monotonic() - looked > 2.0:
+                looked = time.monotonic()
+                nodes = [process.pid for process in graph.processes.values()]
+                seen.most_gib = max(seen.most_gib, sum(map(proportional_kib, nodes)) / 2**20)
+            beat = watcher.beats.get(("voxel_carver", "shadow_mask"))
+            if beat is not None and beat.counts.get("complete"):
+                break
+        seen.ended_s = time.monotonic()
+        watcher.spin(0.5)
+        seen.cpu_s = {name: cpu_seconds(process.pid) for name, process in graph.processes.items()}
+        if graph.deaths or watcher.errors:
+            raise SystemExit(f"the graph failed: {graph.deaths} {watcher.errors}")
+        for (node, _), beat in watcher.beats.items():
+            if "busy_ms" in beat.counts:
+                seen.busy_s[node] = beat.counts["busy_ms"] / 1e3
+    finally:
+        watcher.close()
+    return seen
 
 
 def proportional_kib(pid: int) -> int:
@@ -190,8 +203,8 @@ def _times(bag: Path) -> dict[int, int]:
     return BagViews(BagReader(bag), "sector").times
 
 
-def main() -> int:
-    """Measure, print a table, write JSON; 1 if a bound is not met."""
+def options() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("--profile", default="standard")
     parser.add_argument("--sector-deg", type=float, default=5.0)
@@ -204,16 +217,11 @@ def main() -> int:
     parser.add_argument("--target", choices=("given", "auto"), default="given")
     parser.add_argument("--publish-hz", type=float, default=20.0)
     parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    target = TargetParameters()
-    if arguments.target == "given":
-        box = Target((0.2, -0.1), SIZE_M)
-        target = TargetParameters(target="given", position_m=box.position_m, size_m=box.size_m)
-    parameters = PipelineParameters(
-        sub_aperture=SubApertureParameters(step_deg=arguments.step_deg),
-        carving=CarvingParameters(voxel_size_m=0.02),
-        target=target,
-    )
+    return parser
+
+
+def measured(arguments: argparse.Namespace, parameters: PipelineParameters) -> list[dict[str, Any]]:
+    """Play at every rate, and hold the figures against their bounds."""
     results = []
     with tempfile.TemporaryDirectory() as folder:
         for rate in arguments.rates:
@@ -231,9 +239,11 @@ def main() -> int:
             in_time = result["last_lag_s" if fast else "p95_s"] <= bound_s
             result["met"] = in_time and result["most_gib"] <= bound_gib
             results.append(result)
-    how = f"sectors of {arguments.sector_deg:g}° (lattice: {arguments.sector_lattice})"
-    how += f", target {arguments.target}"
-    print(f"streaming, profile {arguments.profile}, {how}; from a sector to the grid that holds it:")
+    return results
+
+
+def print_table(results: list[dict[str, Any]]) -> None:
+    """Print a row for each rate."""
     print("| rate | arc | sectors | median | p95 | worst | last late by | final grid after |", end="")
     print(" memory | CPU | bound | met |\n" + "|---" * 12 + "|")
     for r in results:
@@ -247,6 +257,25 @@ def main() -> int:
             f" {r['final_grid_after_s']:.2f} s | {r['most_gib']:.2f} GiB | {cpu:.2f} s/s | {what} |"
             f" {'yes' if r['met'] else 'NO'} |"
         )
+
+
+def main() -> int:
+    """Measure, print a table, write JSON; 1 if a bound is not met."""
+    arguments = options().parse_args()
+    target = TargetParameters()
+    if arguments.target == "given":
+        box = Target((0.2, -0.1), SIZE_M)
+        target = TargetParameters(target="given", position_m=box.position_m, size_m=box.size_m)
+    parameters = PipelineParameters(
+        sub_aperture=SubApertureParameters(step_deg=arguments.step_deg),
+        carving=CarvingParameters(voxel_size_m=0.02),
+        target=target,
+    )
+    results = measured(arguments, parameters)
+    how = f"sectors of {arguments.sector_deg:g}° (lattice: {arguments.sector_lattice})"
+    how += f", target {arguments.target}"
+    print(f"streaming, profile {arguments.profile}, {how}; from a sector to the grid that holds it:")
+    print_table(results)
     document = {
         "benchmark": "streaming",
         "options": {k: str(v) if isinstance(v, Path) else v for k, v in vars(arguments).items()},

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -190,19 +191,49 @@ def test_a_node_that_refuses_its_parameters_ends_the_launch_and_one_that_dies_do
         launched.module.end_of_replay(Event(1), None)
 
 
+def final_measurements(domain: int, namespaces: Sequence[str]) -> dict[str, Any]:
+    """Listen, for two minutes at most, until each namespace has published its final result."""
+    import rclpy
+    from rclpy.context import Context
+    from rclpy.executors import SingleThreadedExecutor
+
+    from csas_shadow_ros.nodes import qos
+    from msg_adapters import TOPICS, RclpyMessages, measurements_from_msg
+
+    kind = RclpyMessages().cls(TOPICS["measurements"].type_name)
+    got: dict[str, Any] = {}
+
+    def take(namespace: str, msg: Any) -> None:
+        told = measurements_from_msg(msg)
+        if told.final:
+            got[namespace] = told
+
+    context = Context()
+    with ExitStack() as stack:
+        rclpy.init(context=context, domain_id=domain)
+        stack.callback(rclpy.try_shutdown, context=context)
+        node = rclpy.create_node("listener", context=context)
+        stack.callback(node.destroy_node)
+        executor = SingleThreadedExecutor(context=context)
+        stack.callback(executor.shutdown)
+        executor.add_node(node)
+        for name in namespaces:
+            node.create_subscription(
+                kind, f"/{name}/measurements", lambda msg, name=name: take(name, msg), qos.LATCHED
+            )
+        end = time.monotonic() + 120.0
+        while len(got) < len(namespaces) and time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.1)
+    return got
+
+
 @pytest.mark.long
 def test_two_vehicles_in_one_domain_have_results_and_frames_of_their_own(
     launched: Follow, tmp_path: Path, tiny_box_bag: Any, domain: int
 ) -> None:
     """Each plays its own bag in its own namespace; a listener in the same domain hears both."""
     pytest.importorskip("rclpy")
-    import rclpy
-    from rclpy.context import Context
-    from rclpy.executors import SingleThreadedExecutor
-
     from csas_shadow_ros.bags import write_run
-    from csas_shadow_ros.nodes import qos
-    from msg_adapters import TOPICS, RclpyMessages, measurements_from_msg
 
     made = tiny_box_bag.run
     params = tmp_path / "params.yaml"
@@ -210,8 +241,6 @@ def test_two_vehicles_in_one_domain_have_results_and_frames_of_their_own(
         "/**/sub_aperture:\n  ros__parameters:\n    step_deg: 20.0\n"
         "/**/voxel_carver:\n  ros__parameters:\n    voxel_size_m: 0.08\n"
     )
-    messages, got = RclpyMessages(), {}
-    context = Context()
     with ExitStack() as stack:
         for vehicle in ("auv_1", "auv_2"):
             frame = f"{vehicle}/scene"
@@ -234,28 +263,7 @@ def test_two_vehicles_in_one_domain_have_results_and_frames_of_their_own(
                 process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
                 stack.callback(process.wait, 20)
                 stack.callback(process.send_signal, signal.SIGINT)
-        rclpy.init(context=context, domain_id=domain)
-        stack.callback(rclpy.try_shutdown, context=context)
-        node = rclpy.create_node("listener", context=context)
-        stack.callback(node.destroy_node)
-        executor = SingleThreadedExecutor(context=context)
-        stack.callback(executor.shutdown)
-        executor.add_node(node)
-        kind = messages.cls(TOPICS["measurements"].type_name)
-
-        def take(vehicle: str, msg: Any) -> None:
-            told = measurements_from_msg(msg)
-            if told.final:
-                got[vehicle] = told
-
-        for vehicle in ("auv_1", "auv_2"):
-            node.create_subscription(
-                kind, f"/{vehicle}/measurements", lambda msg, v=vehicle: take(v, msg), qos.LATCHED
-            )
-        for _ in range(1200):
-            if len(got) == 2:
-                break
-            executor.spin_once(timeout_sec=0.1)
+        got = final_measurements(domain, ("auv_1", "auv_2"))
         logs = "\n".join(file.read_text() for file in tmp_path.glob("*.log"))
         assert set(got) == {"auv_1", "auv_2"}, logs
     assert {v: told.frame for v, told in got.items()} == {v: f"{v}/scene" for v in got}

@@ -339,13 +339,20 @@ def test_picture_mesh_link_and_file_can_be_taken_away(watched, serve, run_store,
 def test_every_key_of_the_help_does_what_it_says(watched, serve, run_store):
     watched.open(serve(run_store))
     watched.until("csas.volumes.main && csas.volumes.other")
-    page, js = watched.page, watched.js
+    watched.page.keyboard.press("Tab")  # the first button: keys work wherever the focus is
+    keys_turn_and_switch(watched)
+    keys_move_the_picture(watched)
+    keys_choose_layers_and_measure(watched)
 
-    def press(key: str) -> None:
-        page.keyboard.press(key)
-        watched.drawn()
 
-    page.keyboard.press("Tab")  # the first button: keys work wherever the focus is
+def press(watched, key):
+    """Press a key, and wait until what it changes is drawn."""
+    watched.page.keyboard.press(key)
+    watched.drawn()
+
+
+def keys_turn_and_switch(watched):
+    js = watched.js
     step = 360 / js("csas.views('shadow').length")
     for key, views in (
         ("ArrowRight", 1),
@@ -354,7 +361,7 @@ def test_every_key_of_the_help_does_what_it_says(watched, serve, run_store):
         ("Home", 0),
         ("End", -1),
     ):
-        press(key)
+        press(watched, key)
         assert js("csas.current.aspect_deg") == pytest.approx(views * step % 360), key
     for key, expression, before, after in (
         ("n", "csas.state.orientation", "north", "sonar"),
@@ -367,21 +374,25 @@ def test_every_key_of_the_help_does_what_it_says(watched, serve, run_store):
         ("r", "csas.state.ruling", False, True),
     ):
         assert js(expression) == before
-        press(key)
+        press(watched, key)
         assert js(expression) == after, key
-        press(key)
+        press(watched, key)
         assert js(expression) == before, key
-    press("0")
-    press("+")
+
+
+def keys_move_the_picture(watched):
+    js = watched.js
+    press(watched, "0")
+    press(watched, "+")
     assert js("csas.state.zoom") == pytest.approx(1.25)
     centre = js("csas.state.centre")
-    press("Alt+ArrowRight")
+    press(watched, "Alt+ArrowRight")
     assert js("csas.state.centre[0]") > centre[0]
-    press("Alt+ArrowUp")
+    press(watched, "Alt+ArrowUp")
     assert js("csas.state.centre[1]") > centre[1]
-    press("-")
+    press(watched, "-")
     assert js("csas.state.zoom") == pytest.approx(1.0)
-    press("0")
+    press(watched, "0")
     assert js("[csas.state.zoom, ...csas.state.centre]") == [1, 0, 0]
     span, top = js("[csas.state.range, csas.state.top]")
     for key, wanted in (
@@ -390,27 +401,31 @@ def test_every_key_of_the_help_does_what_it_says(watched, serve, run_store):
         ("Shift+BracketRight", [span, top + 1]),
         ("Shift+BracketLeft", [span, top]),
     ):
-        press(key)
+        press(watched, key)
         assert js("[csas.state.range, csas.state.top]") == wanted, key
+
+
+def keys_choose_layers_and_measure(watched):
+    js = watched.js
     for number, layer in enumerate(js("[...csas.panels[0].select.options].map(o => o.value)"), start=1):
         if layer == "reduced":
             continue  # asks the server for what a run without its image has not
-        press(f"Digit{number}")
-        press(f"Shift+Digit{number}")
+        press(watched, f"Digit{number}")
+        press(watched, f"Shift+Digit{number}")
         assert js("csas.panels.map(p => p.layer)") == [layer, layer]
-    press("r")
-    press("ArrowUp")
+    press(watched, "r")
+    press(watched, "ArrowUp")
     before = js("csas.ruler.ends[1]")
-    press("ArrowRight")
+    press(watched, "ArrowRight")
     assert js("csas.ruler.ends[1][0]") > before[0]
-    press("Delete")
+    press(watched, "Delete")
     assert js("csas.allRulers().length") == 0
-    press("z")
+    press(watched, "z")
     assert js("csas.state.centre") == pytest.approx(js("csas.contact.position_m"))
-    press("0")
-    press("t")
+    press(watched, "0")
+    press(watched, "t")
     surfaces, threshold = js("[csas.stats.surfaces.length, +document.activeElement.value]")
-    press("ArrowRight")
+    press(watched, "ArrowRight")
     assert js("+document.activeElement.value") > threshold
     watched.until(f"csas.stats.surfaces.length > {surfaces}")
 
