@@ -788,10 +788,11 @@ def check_spectrum_sign(image: CoherentImage, track: Track) -> Iterator[tuple[st
     else:
         yield INFO, str(evidence), ""
     for left in () if search is None else search.left_out:
-        if left.reason.startswith(LEAVES):
+        if LEAVES in left.reason:
             x, y = left.position_m
             yield (
                 WARNING,
                 f"something stands at ({x + 0.0:.2f}, {y + 0.0:.2f}) m: {left.reason}",
-                "Process a larger scene: a body with its shadows off the image cannot be judged.",
+                "Process a larger scene: a body with its shadows off the image cannot be judged."
+                + ("" if left.reason.startswith(LEAVES) else " Check spectrum_sign (camera_info.d[3])."),
             )

@@ -65,6 +65,20 @@ def test_a_body_whose_shadows_leave_the_image_is_undecided_and_check_says_so_bef
     assert left.reason in warned[0]
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_shadows_that_leave_the_image_under_the_other_sign_leave_a_doubt(seed):
+    right = simulate("tiny", "cylinder", seed=seed)
+    image = replace(right.image, acoustics=replace(right.image.acoustics, spectrum_sign=-1))
+    evidence, _ = spectrum_sign_evidence(image, right.track)
+    assert evidence.verdict == "unknown"
+    result = run(image, right.track, COARSE)
+    assert (result.verdict == "no object", result.quality.verdict) == (False, "not trustworthy")
+    doubt = "under the other spectrum_sign its shadow leaves the image"
+    assert any(doubt in reason for reason in result.quality.reasons)
+    warned = [text for level, text, _ in check_spectrum_sign(image, right.track) if level == WARNING]
+    assert any(doubt in text for text in warned)
+
+
 def test_dark_sediment_that_leads_out_of_the_image_is_no_body_whose_shadow_does():
     bank = seabed_alone(Seabed(patches=(Patch((0.9, 0.0), (0.5, 1.0), 0.0, -12.0, 0.1),)))
     result = run(bank.image, bank.track, COARSE)

@@ -31,7 +31,7 @@ from ..parameters import (
     SubApertureParameters,
 )
 from ..shape.carving import Carver
-from ..shape.result import LeftOut
+from ..shape.result import OTHER_SIGN, LeftOut
 from ..shape.volume import MARGIN_SHARE, Target, Volume
 
 #: Aperture (deg) of the views that search: narrow enough that shadows stay sharp without enhancement.
@@ -152,6 +152,8 @@ class Search:
     left_out: tuple[LeftOut, ...] = ()
     #: The thrown shadow of each target, in the same order.
     thrown: tuple[Thrown, ...] = ()
+    #: Nothing was evident at first: it was looked again, for the faint.
+    twice: bool = False
 
     @property
     def best(self) -> Target | None:
@@ -240,7 +242,8 @@ def _search(looks: Sequence[_Look], camera: ShadowCamera, extent_m: float, *, tw
     for body in bodies:
         if body.core <= _CORE:
             judged.add(body, looks)
-    if twice and not any(target.stands for target, _ in judged.found):
+    twice = twice and not any(target.stands for target, _ in judged.found)
+    if twice:
         _look_again(judged, looks, volume)
     if twice and not any(target.stands for target, _ in judged.found):
         leaving = _leaving(looks, (float(middle[0]), float(middle[1])), extent_m)
@@ -248,7 +251,7 @@ def _search(looks: Sequence[_Look], camera: ShadowCamera, extent_m: float, *, tw
     # Sorting is stable: what is as evident stays in the order of its place.
     found = sorted(judged.found, key=lambda one: -one[0].evidence)
     targets, thrown = tuple(target for target, _ in found), tuple(thrown for _, thrown in found)
-    return Search(targets, volume, mean, tuple(judged.left_out), thrown)
+    return Search(targets, volume, mean, tuple(judged.left_out), thrown, twice)
 
 
 def _carved(volume: Volume, images: Iterable[View]) -> NDArray[np.float32]:
@@ -633,15 +636,25 @@ def spectrum_sign_evidence(
     looks = _search_looks(views, extent)
     other_image = replace(image, acoustics=replace(image.acoustics, spectrum_sign=-sign))
     turned = list(_under_other_sign(looks, _searching(other_image, track, spectrum)))
-    stated, other = _search(looks, camera, extent), _search(turned, camera, extent, twice=False)
+    stated = _search(looks, camera, extent)
+    # What is only faint proves nothing before as much was looked for under the other sign.
+    other = _search(turned, camera, extent, twice=stated.twice)
     best = stated.best.evidence if stated.best is not None else 0.0
+    if leaving := [left for left in other.left_out if left.reason.startswith(LEAVES)]:
+        best = 0.0
+        doubts = (replace(left, reason=f"{OTHER_SIGN} {left.reason}") for left in leaving)
+        stated = replace(stated, left_out=(*stated.left_out, *doubts))
     contrary = [
         target.evidence
         for target, thrown in zip(other.targets, other.thrown, strict=True)
         if not thrown.front >= _PLAIN
     ]
-    evidence = SignEvidence(sign, best, max(contrary, default=0.0))
-    if not contrary and other.best is not None and other.best.evidence > _SIGN_RATIO * best:
+    against = max(contrary, default=0.0)
+    if other.twice:
+        against = min(against, best)  # what is faint raises doubts, and proves no sign wrong
+    evidence = SignEvidence(sign, best, against)
+    evident = other.best is not None and not other.twice and other.best.evidence > _SIGN_RATIO * best
+    if other.best is not None and evident and not contrary:
         hollow = LeftOut(other.best.position_m, HOLLOW, strong=True)
         stated = replace(stated, left_out=(*stated.left_out, hollow))
     return evidence, stated

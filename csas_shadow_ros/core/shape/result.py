@@ -84,6 +84,10 @@ class ViewEvidence:
     lit: float = math.nan
 
 
+#: How a reason begins that doubts the image's spectrum sign, and with it whatever was carved.
+OTHER_SIGN = "under the other spectrum_sign"
+
+
 @dataclass(frozen=True)
 class LeftOut:
     """A body that is not an object, or was not examined: its place (x, y) and the reason.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .mesh import Dimensions
-from .result import Quality, Result
+from .result import OTHER_SIGN, Quality, Result
 from .volume import VoxelGrid
 
 #: A result of less of the circle is limited: what is not seen from the other side is bounded by the volume
@@ -78,6 +78,9 @@ def _decide(result: Result, reasons: list[str]) -> int:
     first = next(iter(result.rejected.values()), "")
     if result.objects:
         result.verdict = "object"
+        if doubts := [left.reason for left in result.left_out if left.reason.startswith(OTHER_SIGN)]:
+            reasons += [f"spectrum_sign may be wrong: {doubt}" for doubt in doubts]
+            worst = 2
     elif result.target is not None and not result.views_used:
         result.verdict = "undecided"
         reasons.append(f"no view of the target was usable{': ' if first else ''}{first}")
