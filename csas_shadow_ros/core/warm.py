@@ -129,7 +129,10 @@ def warm_carving(parameters: CarvingParameters | None = None) -> None:
 
 
 def warm_sub_apertures() -> None:
-    """Sum two small sectors, and make a view of the sum."""
+    """Sum two small sectors, and make a view of the sum.
+
+    In one thread: who loads kernels for others forks them, and a pool of threads may not outlive that.
+    """
     from .imaging.subaperture import SubApertures
     from .sectors.sector import Sector
     from .sectors.streaming import SectorSum
@@ -139,7 +142,7 @@ def warm_sub_apertures() -> None:
     track = Track(np.arange(theta.size) * 1_000_000_000, circle)
     spacing = 0.004
     grid = GroundGrid(_SIDE, _SIDE, spacing, -spacing * _SIDE / 2.0, spacing * _SIDE / 2.0)
-    total = SectorSum()
+    total = SectorSum(workers=1)
     for stamp, aspect in enumerate((0.0, math.radians(30.0)), start=1):
         f_c = _ACOUSTICS.centre_frequency_hz
         k = _ACOUSTICS.ground_wavenumber(f_c, track.grazing_rad) * unit_to_sonar(aspect)
@@ -147,7 +150,9 @@ def warm_sub_apertures() -> None:
         pixels = _speckle(_SIDE, _SIDE)
         pixels.flags.writeable = stamp == 1
         total.add(Sector(pixels, grid, _ACOUSTICS, stamp, aspect, math.radians(30.0), carrier))
-    made = SubApertures(total.frame, track, SubApertureParameters(), spectrum=total.spectrum)
+    made = SubApertures(
+        total.frame, track, SubApertureParameters(), spectrum=total.spectrum, workers=1
+    )
     made.view_of_aspect(0.2)
 
 

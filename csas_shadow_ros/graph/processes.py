@@ -353,8 +353,12 @@ class ForkServer:
         self.close()
 
     def kill(self) -> None:
-        """Kill a server that does not answer."""
-        self._server.kill()
+        """Kill a server that does not answer, and whoever of its making is not a node yet.
+
+        What is forked may hang as well, and holds the pipe of the answers: these would never end.
+        """
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._server.pid, signal.SIGKILL)
 
     def end(self) -> None:
         """End the server: pending requests fail, its processes run on."""
@@ -365,7 +369,7 @@ class ForkServer:
         try:
             self._server.wait(_GRACE_S)
         except subprocess.TimeoutExpired:
-            self._server.kill()
+            self.kill()
             self._server.wait()
         self._reader.join()
 
@@ -374,7 +378,7 @@ class ForkServer:
         try:
             self.end()
         except BaseException:
-            self._server.kill()
+            self.kill()
             self._server.wait()
             raise
         finally:

@@ -636,6 +636,55 @@ def test_it_is_found_out_that_an_own_port_was_replaced(port: Path, monkeypatch: 
         assert reach.is_given_up
 
 
+def test_a_fork_server_that_is_killed_answers_also_if_what_it_forked_hangs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "stuck" / "nodes" / "runtime"
+    package.mkdir(parents=True)
+    (package / "fork_server.py").write_text("import os, time\nos.fork()\ntime.sleep(600)\n")
+    monkeypatch.setattr(graph_module, "PACKAGE", "stuck")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    with graph_module.ForkServer(environment, tmp_path / "log") as server:
+        coming = server.start("composites", [], tmp_path / "log")
+        group = server.pid
+        while len(members(group)) < 2:
+            time.sleep(0.05)
+        server.kill()
+        with pytest.raises(ReplayError, match="the fork server has ended"):
+            coming.result(timeout=30)
+        assert not members(group)
+
+
+def members(group: int) -> list[int]:
+    """Return the running processes of a process group."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            state, _, of_group = entry.read_text().rpartition(")")[2].split()[:3]
+            if int(of_group) == group and state != "Z":
+                found.append(int(entry.parent.name))
+    return found
+
+
+def test_what_forks_nodes_has_started_no_thread_that_computes() -> None:
+    code = """
+import os
+from csas_shadow_ros.nodes.runtime import fork_server
+from csas_shadow_ros.nodes.runtime.params import NODES
+before = len(os.listdir("/proc/self/task"))  # the middleware's tracing has some
+fork_server._threads_of_images(1)
+for node in NODES:
+    fork_server.load(node)
+print(before, len(os.listdir("/proc/self/task")))
+"""
+    environment = {**os.environ, **dict.fromkeys(graph_module.THREADS_OF_LIBRARIES, "1")}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    before, after = done.stdout.split()
+    assert after == before
+
+
 def test_views_that_are_sent_again_and_again_are_no_progress_of_a_replay() -> None:
     def at(**counts: int) -> tuple[str, int, int, int]:
         return module._got_through(Heartbeat(0, "sub_aperture", "s-1", "source", counts))

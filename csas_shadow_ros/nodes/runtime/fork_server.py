@@ -9,6 +9,9 @@ standard input: ``{"node": name, "arguments": [...], "log": path}``. Each is ans
 order: ``{"pid": number}``, or ``{"error": text}``. The process ends with its input, or on SIGTERM. A node's
 parent is not this process but the nearest ancestor that takes orphans in (``PR_SET_CHILD_SUBREAPER``): its
 end can be waited for there, and it lives on if this process dies.
+
+Nothing is computed here by more than one thread. Libraries end their threads before a fork and start them
+after it; one that forks again at once can wait for ever for a thread that has just begun (scipy's FFT).
 """
 
 from __future__ import annotations
@@ -65,9 +68,10 @@ def fork(main: Any, node: str, arguments: list[str], log: str, answers: int) -> 
     if between == 0:
         # Whatever happens, this process ends here: there is one server.
         try:
+            os.close(answers)  # who reads there waits for the server alone
             pid = os.fork()
             if pid == 0:
-                for descriptor in (reader, writer, answers):
+                for descriptor in (reader, writer):
                     os.close(descriptor)
                 _become(main, node, arguments, log)
             os.write(writer, str(pid).encode())
@@ -80,6 +84,13 @@ def fork(main: Any, node: str, arguments: list[str], log: str, answers: int) -> 
     if not told:
         raise RuntimeError("no further process could be made")
     return int(told)
+
+
+def _threads_of_images(count: int) -> None:
+    """Say how many threads OpenCV may use; -1: as many as it does by itself."""
+    import cv2
+
+    cv2.setNumThreads(count)
 
 
 def _become(main: Any, node: str, arguments: list[str], log: str) -> None:
@@ -97,6 +108,7 @@ def _become(main: Any, node: str, arguments: list[str], log: str) -> None:
         for source, target in ((nothing, 0), (output, 1), (output, 2)):
             os.dup2(source, target)
         sys.argv = [node, *arguments]
+        _threads_of_images(-1)
         parent = int(os.environ.get("CSAS_PARENT_PID", "0"))
         deadline = time.monotonic() + 1.0
         while parent and os.getppid() != parent and time.monotonic() < deadline:
@@ -130,6 +142,7 @@ def main() -> int:
     os.dup2(2, 1)
     # Loading leaves next to no garbage; to look for it among all that is loaded takes a tenth of the time.
     gc.disable()
+    _threads_of_images(1)
     # Every node reads raw messages: a fifth of a second of imports, at the first one.
     typestore()
     for node in sys.argv[1:]:
