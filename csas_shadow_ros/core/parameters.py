@@ -1,7 +1,7 @@
 """Parameters of every stage: one bounded, described dataclass each.
 
 The same dataclasses drive the in-process pipeline, the ROS parameter descriptors, the YAML file and
-the README's table. Users meet degrees here (``_deg``); the code behind works in radians.
+the table of docs/parameters.md. Users meet degrees here (``_deg``); the code behind works in radians.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """The whole method: a circular run in, a 3-D shape out.
 
-Read this first. `ProcessedView` is the paper, a property a step, each beside its section; the module that it
-calls holds the equation, and `reference.py` the same step written out literally. `run` strings the steps
-together: find what to carve, take every view through them, carve, measure. The node graph takes its views
-through the same properties and feeds the same `Reconstruction`, and so says the same.
+Read this first. Steps of the paper, and what holds their equations: 3.1 `SubApertures.view_of_aspect`, 3.2
+`enhance`, 4.1 `segment_shadow`, 4.2 `likelihood.l_out`; carving, 4.1 and 4.2, `carving.Carver.integrate`, to
+which `Reconstruction.feed` leads; 4.2 threshold and surface, `threshold.occupied_voxels` and
+`mesh.mesh_from_grid`. `reference.py` has all of them literally. `run` strings them together; the node graph
+takes its views through the same properties and feeds the same `Reconstruction`.
 """
 
 from __future__ import annotations
@@ -71,9 +72,9 @@ class ProcessedView:
     @cached_property
     def likelihood(self) -> View | None:
         """l_out = (p_r / (p_r + p_s))² (4.2)."""
-        if self.shadow is None:
-            return None
-        return outside_likelihood(self.shadow, self.p.likelihood, self.levels)
+        return (
+            None if self.shadow is None else outside_likelihood(self.shadow, self.p.likelihood, self.levels)
+        )
 
     @cached_property
     def mask(self) -> View | None:

@@ -169,7 +169,7 @@ class ResultsWriter:
         self._to_bag(lambda bag: bag.write_source(image, track, reader))
 
     def add_view(self, view: ProcessedView) -> None:
-        """Take one processed view: the `on_view` of `pipeline.run` and `stages.run_views`."""
+        """Take one processed view: the `on_view` of `pipeline.run` and `later_stages.run_views`."""
         start = time.perf_counter()
         self.show_view(view)
         shown: list[tuple[str, View | None]] = [(s, getattr(view, name)) for s, name in _STREAMS.items()]

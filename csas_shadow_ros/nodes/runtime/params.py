@@ -1,8 +1,8 @@
 """Parameters of the nodes: the core's dataclasses, plus those that only a node needs.
 
-One dataclass a node drives its ROS parameter descriptors, ``config/csas_shadow.yaml`` and the README's
-table; a test holds the three together. ``python -m csas_shadow_ros.nodes.runtime.params`` prints the table,
-with ``--yaml`` the YAML file.
+One dataclass a node drives its ROS parameter descriptors, ``config/csas_shadow.yaml`` and the table of
+docs/parameters.md; a test holds the three together. ``python -m csas_shadow_ros.nodes.runtime.params`` prints
+the table, with ``--yaml`` the YAML file.
 """
 
 from __future__ import annotations
