@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import rclpy
 from numpy.typing import NDArray
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -40,6 +41,7 @@ from msg_adapters.topics import topic as topic_of
 from .nodes import qos
 from .nodes.runtime.base import BEAT_S, Inlet, ViewOutlet
 from .nodes.runtime.flow import place_of
+from .nodes.runtime.hearing import Reach, avoid_dead_ports
 
 #: What a callback gives back: nothing, the pixels of its result, or in words why it cannot use the view.
 Answer = NDArray[Any] | str | None
@@ -48,6 +50,46 @@ _LONELY_S = 5.0
 _STOP_S = 0.05
 #: Outcomes that are remembered, for views that come twice: days of views, a few MB.
 _REMEMBERED = 1 << 16
+
+
+#: Why a view subscriber hears nobody, and what helps.
+DEAF = (
+    "others write to ports in shared memory that this process has not, so it hears nobody; start it again,"
+    " and make its node by csas_shadow_ros.client.create_node"
+)
+
+
+def create_node(name: str, **options: Any) -> Any:
+    """Make a node as `rclpy.create_node` does, also where one of its name was killed just before.
+
+    The middleware gives a new process the ports in shared memory of one that was killed. The others write to
+    the old ones for some seconds, or for good. This takes ports that nobody writes to.
+
+    Parameters
+    ----------
+    name : str
+        The node's name.
+    **options
+        What `rclpy.create_node` takes: ``namespace``, ``context``, …
+
+    Returns
+    -------
+    rclpy.node.Node
+        The node.
+
+    Examples
+    --------
+    >>> import rclpy
+    >>> from csas_shadow_ros.client import create_node
+    >>> rclpy.init()
+    >>> node = create_node("classifier", namespace="csas")
+    >>> node.get_fully_qualified_name()
+    '/csas/classifier'
+    >>> node.destroy_node()
+    >>> rclpy.shutdown()
+    """
+    with avoid_dead_ports():
+        return rclpy.create_node(name, **options)
 
 
 class ViewSubscriber:
@@ -108,6 +150,7 @@ class ViewSubscriber:
         self._callback = callback
         self._stream = stream
         self._host = _Host(node, self._look)
+        self._reach = Reach()
         self._target: TargetBox | None = None
         self._wake = threading.Condition()
         self._waiting: OrderedDict[int, tuple[Any, Any]] = OrderedDict()
@@ -236,6 +279,9 @@ class ViewSubscriber:
     # In the heartbeats' thread
 
     def _look(self, age_s: float) -> None:
+        if self._reach.is_lost():
+            self._host.unable = DEAF  # nobody waits for it for long
+            self._host.node.get_logger().error(DEAF)
         topic = stream_of(self._stream).image_topic
         if age_s > _LONELY_S and not self._host.count_publishers(topic):
             name = self._host.node.resolve_topic_name(topic)
@@ -388,4 +434,4 @@ def spin(node: Any, timeout_s: float | None = None) -> None:
             signal.signal(number, handler)
 
 
-__all__ = ["ViewSubscriber", "spin"]
+__all__ = ["ViewSubscriber", "create_node", "spin"]

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import rclpy
 
-from csas_shadow_ros.client import ViewSubscriber, spin
+from csas_shadow_ros.client import ViewSubscriber, create_node, spin
 
 SECONDS_A_VIEW = float(sys.argv[1]) if len(sys.argv) > 1 else 0.0
 
@@ -20,6 +20,6 @@ def classify(pixels, info):
 
 
 rclpy.init()
-node = rclpy.create_node("classifier", namespace="csas")
+node = create_node("classifier", namespace="csas")
 with ViewSubscriber(node, "shadow", classify):
     spin(node)

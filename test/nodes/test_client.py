@@ -24,10 +24,12 @@ from graph_of_nodes import VOXEL_M
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
+from csas_shadow_ros import client
 from csas_shadow_ros.client import ViewSubscriber
 from csas_shadow_ros.core.errors import ParameterError
 from csas_shadow_ros.graph.processes import DomainReservation, Graph, graph_environment, start_fork_server
 from csas_shadow_ros.nodes import qos
+from csas_shadow_ros.nodes.runtime.shared_memory import owned_files
 from msg_adapters import Heartbeat, RclpyMessages, measurements_from_msg, progress_from_msg
 from msg_adapters.topics import TOPICS
 
@@ -325,10 +327,53 @@ def test_what_cannot_be_subscribed_to_is_refused() -> None:
         ViewSubscriber(None, "likelihood", lambda *_: None, results="shadow_mask")
 
 
+WAITS = """
+import rclpy
+from csas_shadow_ros.client import create_node
+
+rclpy.init()
+node = create_node("classifier", namespace="csas")
+print("there", flush=True)
+rclpy.spin(node)
+"""
+
+
+def test_a_node_that_was_killed_comes_back_at_ports_that_nobody_writes_to(graph: Any, tmp_path: Path) -> None:
+    graph.plain_node("onlooker")
+    environment = graph_environment(graph.domain_id, tmp_path)
+    taken: list[set[str]] = []
+    for _ in range(2):
+        with subprocess.Popen(
+            [sys.executable, "-c", WAITS], env=environment, stdout=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "there\n"
+            taken.append({name for name in owned_files(process.pid) if "_port" in name})
+            deadline = time.monotonic() + 60
+            while not all(name in Path("/proc/self/maps").read_text() for name in taken[-1]):
+                assert time.monotonic() < deadline, "the onlooker writes to it"
+                graph.executor.spin_once(timeout_sec=0.05)
+            process.kill()
+    assert len(taken[0]) == len(taken[1]) == 2
+    assert not taken[0] & taken[1]
+
+
+def test_a_subscriber_that_hears_nobody_says_so_and_is_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch, reference: Any
+) -> None:
+    class Lost:
+        def is_lost(self) -> bool:
+            return True
+
+    monkeypatch.setattr(client, "Reach", Lost)
+    told = in_one_process(lambda *_: time.sleep(1.5), [reference[1][0].shadow], beats=True)
+    assert any(item.values.get("unable") == client.DEAF for item in told if isinstance(item, Heartbeat))
+
+
 def in_one_process(
-    callback: Callable[..., Any], views: Sequence[Any], results: str | None = None
+    callback: Callable[..., Any], views: Sequence[Any], results: str | None = None, *, beats: bool = False
 ) -> list[Any]:
-    """Publish views to a subscriber in this process; return what it reports."""
+    """Publish views to a subscriber in this process; return what it reports, or with `beats` all it says."""
     from csas_shadow_ros.core.geometry import View
     from msg_adapters import view_to_msgs
 
@@ -362,7 +407,7 @@ def in_one_process(
                 spin(lambda n=number: sum(not isinstance(t, Heartbeat) for t in told) >= n)
             made.close()
         spin(lambda: isinstance(told[-1], Heartbeat) and told[-1].values.get("leaving") == "true")
-        return [t for t in told if not isinstance(t, Heartbeat)]
+        return told if beats else [t for t in told if not isinstance(t, Heartbeat)]
     finally:
         executor.shutdown(timeout_sec=1.0)
         node.destroy_node()
