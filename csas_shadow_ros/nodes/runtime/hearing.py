@@ -34,6 +34,8 @@ _FILES = "/proc/self/fd"
 #: A port's file; one that is open and has another in its place, as the kernel tells of it.
 _PORT = re.compile(rf"{_SHARED}port\d+")
 _DELETED = re.compile(rf"({_SHARED}port\d+) \(deleted\)")
+#: The first port of domains, whose numbers follow the participant's; those before are taken by their locks.
+_OF_DOMAINS = 7400
 #: A participant listens at two ports: what it discovers comes by the one, all else by the other.
 _PORTS = 2
 #: A process that is killed lets go of its ports within milliseconds, on a busy one within seconds.
@@ -146,10 +148,13 @@ def avoid_dead_ports() -> Iterator[list[str]]:
                 written.update(_PORT.findall(other.read_text(errors="replace")))
         for port in dead.keys() - written:
             dead.pop(port).close()
-        for port in dead:
-            # Participants are numbered by the first of their UDP ports that is free, which is even.
+        for port, lock in dead.items():
+            # Participants are numbered by the first of their UDP ports that is free, which is even; the ports
+            # of that number need no lock, which would make them look alive to others.
             if (holder := bound(int(port.rpartition("_port")[2]) & ~1)) is not None:
                 stack.enter_context(holder)
+                if int(port.rpartition("_port")[2]) >= _OF_DOMAINS:
+                    lock.close()
         yield sorted(dead)
 
 
