@@ -34,6 +34,8 @@ _FILES = "/proc/self/fd"
 #: A port's file; one that is open and has another in its place, as the kernel tells of it.
 _PORT = re.compile(rf"{_SHARED}port\d+")
 _DELETED = re.compile(rf"({_SHARED}port\d+) \(deleted\)")
+#: Who looks whether a port is free holds its lock for less than this.
+_PROBE_S = 0.01
 #: The first port of domains, whose numbers follow the participant's; those before are taken by their locks.
 _OF_DOMAINS = 7400
 #: A participant listens at two ports: what it discovers comes by the one, all else by the other.
@@ -137,11 +139,14 @@ def avoid_dead_ports() -> Iterator[list[str]]:
         Their files.
     """
     with contextlib.ExitStack() as stack:
-        dead = {}
-        for owner in Path(_SHARED).parent.glob(f"{Path(_SHARED).name}port*{_OWNER}"):
-            port = str(owner).removesuffix(_OWNER)
-            if (lock := _locked(port)) is not None:
-                dead[port] = stack.enter_context(lock)
+        owners = Path(_SHARED).parent.glob(f"{Path(_SHARED).name}port*{_OWNER}")
+        ports = {str(owner).removesuffix(_OWNER) for owner in owners}
+        dead: dict[str, IO[bytes]] = {}
+        for _ in range(2):
+            for port in ports - dead.keys():
+                if (lock := _locked(port)) is not None:
+                    dead[port] = stack.enter_context(lock)
+            time.sleep(_PROBE_S)  # another that looks for a port may hold a dead one's lock for a moment
         written: set[str] = set()
         for other in Path("/proc").glob("[0-9]*/maps") if dead else ():
             with contextlib.suppress(OSError):  # of another user, or gone meanwhile
