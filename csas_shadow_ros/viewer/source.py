@@ -278,6 +278,8 @@ class PathSource:
 
     def start(self) -> None:
         """Register what can be read at once; the rest goes on in a thread."""
+        # What is found comes first: a page that is open already would say that there is nothing.
+        self._findings()
         first = [s for s in ("shadow", "sub_aperture") if s in self._held] or self._held[:1]
         try:
             index: BagIndex | None = BagIndex(self._reader)
@@ -308,7 +310,7 @@ class PathSource:
 
             self.store.put_view(name, Entry(infos[stamp], revision, load))
 
-    def _small_parts(self) -> None:
+    def _findings(self) -> None:
         store = self.store
         if self._report:
             store.put_dimensions(self._report.get("dimensions"))
@@ -319,6 +321,9 @@ class PathSource:
             self._guarded("report.json", lambda: store.put_part("contacts", contacts_of(self._report)))
         if self._folder is not None:
             self._open_desk(self._folder)
+
+    def _small_parts(self) -> None:
+        store = self.store
         for _, message, _ in checked_messages(self._reader, "track", self._problem):
             store.put_track(track_from_msg(message))
         for _, message, _ in checked_messages(self._reader, "target", self._problem):

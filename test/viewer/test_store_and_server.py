@@ -56,6 +56,28 @@ def test_a_bag_that_was_cut_off_is_shown_and_said_to_be(results, tmp_path) -> No
     assert "result.mcap" in store.scene()["damage"]
 
 
+def test_what_was_found_is_there_before_the_first_view(results):
+    order = []
+
+    class Noted(ViewStore):
+        def put_part(self, name, value):
+            order.append(name)
+            super().put_part(name, value)
+
+        def put_desk(self, document):
+            order.append("desk")
+            super().put_desk(document)
+
+        def put_view(self, name, entry):
+            order.append("view")
+            super().put_view(name, entry)
+
+    source = PathSource(Noted(), results)
+    source.start()
+    assert source.done.wait(60)
+    assert {"report", "contacts", "desk"} <= set(order[: order.index("view")])
+
+
 def test_a_grid_that_is_none_is_named_and_no_page_is_saved_without_it(results, tmp_path, capsys) -> None:
     folder, page = tmp_path / "bad", tmp_path / "page.html"
     shutil.copytree(results, folder)
