@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import itertools
 import shutil
 import sys
 import time
@@ -43,6 +44,12 @@ _FLUSH_S = 1.0
 #: So much of the disk is left free: an index of 10 000 views, some MB, is needed to finish a bag, and others
 #: that share the disk (logs, results) can still say what is wrong.
 _RESERVE = 16 << 20
+
+
+def _unused(cut: Path, kind: str) -> Path:
+    """Return a name beside an unfinished recording's that nothing has yet."""
+    names = (cut.with_name(f"{cut.stem}.{kind}{number or ''}") for number in itertools.count())
+    return next(name for name in names if not name.exists())
 
 
 def _bag_of_run(out: Path, number: int) -> Path:
@@ -162,11 +169,18 @@ class BagRecorderNode(CsasNode):
     def _open_bag(self, path: Path) -> RunBag:
         cut = path.with_name(f"{path.name}.cut")
         finished = (path / "metadata.yaml").exists()
-        if path.exists() and (self.parameters.resume or not finished):
+        for left in path.parent.iterdir() if path.parent.exists() else ():
+            if left.name.startswith(f"{path.name}.taken"):
+                shutil.rmtree(left)  # its recorder was killed before it had done so
+        if cut.exists():
+            # A recorder was killed while it took over what another one had left: all of that is still there,
+            # and its own bag holds nothing else.
+            if finished:
+                raise BagError(f"{cut} and {path} are both there; expected one of them: remove or rename one")
+            shutil.rmtree(path, ignore_errors=True)
+        elif path.exists() and (self.parameters.resume or not finished):
             # A recorder was killed here: its bag has no end. Or it was ended, and is to go on. What the bag
             # holds goes into the new one.
-            if cut.exists():
-                raise BagError(f"{cut} and {path} are both unfinished; expected at most one")
             path.rename(cut)
         fast = self.parameters.compress and self.parameters.compression == "lz4"
         bag = RunBag(path, BagWriter(path, compress="lz4" if fast else self.parameters.compress))
@@ -179,7 +193,9 @@ class BagRecorderNode(CsasNode):
         try:
             reader = BagReader(cut)
         except BagError as error:
-            self.get_logger().warning(f"{error}; the unfinished recording is unusable")
+            kept = _unused(cut, "unusable")
+            cut.rename(kept)
+            self.get_logger().warning(f"{error}; the unfinished recording is unusable, and kept as {kept}")
             return
         namespace = absolute_name("", self.get_namespace()).rstrip("/")
         prefix = f"{namespace}/"
@@ -191,9 +207,10 @@ class BagRecorderNode(CsasNode):
                 self._write(bag, relative, bytes(message.cdr), message.log_time_ns, report=False)
         bag.run_ns = next(iter(self._book.names), None)
         self.get_logger().info(f"took over {len(bag.seen)} messages of an unfinished recording")
-        for file in cut.iterdir():
-            file.unlink()
-        cut.rmdir()
+        # In one step: what is left of it is a whole recording, or none.
+        taken = _unused(cut, "taken")
+        cut.rename(taken)
+        shutil.rmtree(taken)
 
     def _close_bag(self, bag: RunBag) -> None:
         self._bags.remove(bag)

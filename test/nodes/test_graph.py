@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ pytest.importorskip("rclpy")
 
 from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M, Graph
 
-from csas_shadow_ros.bags import read_run, write_run
+from csas_shadow_ros.bags import BagReader, read_run, write_run
 from csas_shadow_ros.core.imaging.likelihood import outside_likelihood
 from csas_shadow_ros.core.pipeline import ProcessedView, Result
 from csas_shadow_ros.core.sectors.sector import Sector
@@ -429,6 +430,39 @@ def test_a_killed_recorder_is_followed_by_one_that_keeps_what_was_recorded(
     assert run.counts["likelihood"] == 36
     assert run.problems == []
     assert not out.with_name("recording.cut").exists()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_recorder_that_is_killed_while_it_takes_a_bag_over_loses_nothing_of_it(
+    graph: Graph, run_bag: Path, tmp_path: Path, share: float
+) -> None:
+    out = tmp_path / "recording"
+    cut = out.with_name("recording.cut")
+    out.with_name("recording.taken").mkdir()  # of one that was killed even earlier
+    shutil.copytree(run_bag, cut)  # what the first one left
+    (cut / "metadata.yaml").unlink()
+    (whole,) = cut.glob("*.mcap")
+    if share:
+        out.mkdir()  # what its successor had written of it when it was killed too
+        (out / "recording_0.mcap").write_bytes(whole.read_bytes()[: int(share * whole.stat().st_size)])
+    recorder = graph.add(BagRecorderNode, out=str(out))
+    graph.executor.remove_node(recorder)
+    graph.nodes.remove(recorder)
+    recorder.stop()
+    recorder.destroy_node()
+    found, left = (sorted((m.topic, bytes(m.cdr)) for m in BagReader(bag).messages()) for bag in (out, run_bag))
+    assert found == left
+    assert sorted(path.name for path in tmp_path.glob("recording*")) == ["recording"]
+
+
+def test_an_unfinished_recording_that_cannot_be_read_is_kept_under_another_name(
+    graph: Graph, tmp_path: Path
+) -> None:
+    out = tmp_path / "recording"
+    out.mkdir()
+    (out / "recording_0.mcap").write_bytes(b"no bag at all")
+    graph.add(BagRecorderNode, out=str(out))
+    assert (tmp_path / "recording.unusable" / "recording_0.mcap").read_bytes() == b"no bag at all"
 
 
 @pytest.mark.parametrize("sync", [True, False])
