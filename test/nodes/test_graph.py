@@ -450,7 +450,9 @@ def test_a_recorder_that_is_killed_while_it_takes_a_bag_over_loses_nothing_of_it
     graph.nodes.remove(recorder)
     recorder.stop()
     recorder.destroy_node()
-    found, left = (sorted((m.topic, bytes(m.cdr)) for m in BagReader(bag).messages()) for bag in (out, run_bag))
+    found, left = (
+        sorted((m.topic, bytes(m.cdr)) for m in BagReader(bag).messages()) for bag in (out, run_bag)
+    )
     assert found == left
     assert sorted(path.name for path in tmp_path.glob("recording*")) == ["recording"]
 
