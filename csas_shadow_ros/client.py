@@ -285,7 +285,11 @@ class ViewSubscriber:
         topic = stream_of(self._stream).image_topic
         if age_s > _LONELY_S and not self._host.count_publishers(topic):
             name = self._host.node.resolve_topic_name(topic)
-            self._host.warn_once(f"nobody publishes {name}: this node and the run wait for it")
+            domain = self._host.node.context.get_domain_id()
+            self._host.warn_once(
+                f"nobody in ROS domain {domain} publishes {name}: waiting; expected a graph in the same"
+                " domain (ROS_DOMAIN_ID) and namespace"
+            )
 
 
 class _Host:
