@@ -41,7 +41,12 @@ from csas_shadow_ros.graph.processes import (
 )
 from csas_shadow_ros.graph.replay import replay
 from csas_shadow_ros.nodes.runtime import hearing
-from csas_shadow_ros.nodes.runtime.shared_memory import owned_files, segments_of
+from csas_shadow_ros.nodes.runtime.shared_memory import (
+    owned_files,
+    ports_of,
+    remove_unmade_ports,
+    segments_of,
+)
 from csas_shadow_ros.simulation import SimulatedRun
 from msg_adapters import Heartbeat
 
@@ -711,6 +716,26 @@ def test_the_port_of_a_killed_process_is_avoided_as_long_as_others_write_to_it(p
         end()
         with hearing.avoid_dead_ports() as avoided:
             assert str(port) not in avoided, "nobody writes to it"
+
+
+def test_a_port_that_its_killed_maker_left_unmade_holds_nobody_up(domain: int, tmp_path: Path) -> None:
+    unmade = Path(f"/dev/shm/fastrtps_port{ports_of(domain)[11]}")  # the first that a participant opens
+    unmade.write_bytes(bytes(206_000))
+    os.utime(unmade, (time.time() - 60.0,) * 2)
+    fresh = unmade.with_name(f"{unmade.name}0")
+    fresh.write_bytes(bytes(206_000))
+    try:
+        assert remove_unmade_ports() == [unmade]
+        assert fresh.exists(), "it may be in the making"
+        unmade.write_bytes(bytes(206_000))
+        os.utime(unmade, (time.time() - 60.0,) * 2)
+        with Graph({"composites": {}}, domain, tmp_path) as graph:
+            deadline = time.monotonic() + 60
+            while ": active" not in graph.processes["composites"].log.read_text():
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+    finally:
+        fresh.unlink()
 
 
 def test_a_successor_takes_other_ports_than_the_killed_node_that_others_still_write_to(

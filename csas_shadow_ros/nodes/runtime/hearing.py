@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
-from .shared_memory import bound, owned_files
+from .shared_memory import bound, owned_files, remove_unmade_ports
 
 Made = TypeVar("Made")
 
@@ -94,6 +94,7 @@ class Reach:
         now_s = time.monotonic()
         if now_s >= self._own_look_s:
             self._own_look_s = now_s + _OWN_LOOK_S
+            remove_unmade_ports()  # another may wait for one
             if lost := self._own & _deleted(Path("/proc/self/maps")):
                 self._ports, self._looks_s, self.is_given_up = lost, [], True
                 return True
@@ -138,6 +139,7 @@ def avoid_dead_ports() -> Iterator[list[str]]:
     list of str
         Their files.
     """
+    remove_unmade_ports()
     with contextlib.ExitStack() as stack:
         owners = Path(_SHARED).parent.glob(f"{Path(_SHARED).name}port*{_OWNER}")
         ports = {str(owner).removesuffix(_OWNER) for owner in owners}
