@@ -57,19 +57,20 @@ def _held() -> tuple[int, set[str]]:
     return len(files) - len(ports), ports
 
 
-def _replaced(ports: set[str]) -> set[str]:
-    """Return those ports of which another process has an older file open: nobody reads what it writes."""
-    found: set[str] = set()
-    for other in Path("/proc").glob("[0-9]*/maps"):
-        found |= _deleted(other)
-    return ports & found
-
-
-def _deleted(maps: Path) -> set[str]:
-    """Return the ports of which a process has a file open that is no longer there."""
+def _open_in(maps: Path, kind: re.Pattern[str]) -> set[str]:
+    """Return the ports of a kind whose files a process has open, as its `maps` tell."""
     with contextlib.suppress(OSError):  # of another user, or gone meanwhile
-        return set(_DELETED.findall(maps.read_text(errors="replace")))
+        return set(kind.findall(maps.read_text(errors="replace")))
     return set()
+
+
+def _open_anywhere(kind: re.Pattern[str]) -> set[str]:
+    """Return the ports of a kind whose files any process has open."""
+    return set().union(*(_open_in(maps, kind) for maps in Path("/proc").glob("[0-9]*/maps")))
+
+
+def _number(port: str) -> int:
+    return int(port.rpartition("_port")[2])
 
 
 class Reach:
@@ -95,13 +96,13 @@ class Reach:
         if now_s >= self._own_look_s:
             self._own_look_s = now_s + _OWN_LOOK_S
             remove_unmade_ports()  # another may wait for one
-            if lost := self._own & _deleted(Path("/proc/self/maps")):
+            if lost := self._own & _open_in(Path("/proc/self/maps"), _DELETED):
                 self._ports, self._looks_s, self.is_given_up = lost, [], True
                 return True
         if not self._looks_s or now_s < self._looks_s[0]:
             return False
         del self._looks_s[0]
-        self._ports = _replaced(self._ports)
+        self._ports &= _open_anywhere(_DELETED)  # nobody reads what is written there
         if not self._ports:
             self._looks_s = []
         self.is_given_up = bool(self._ports) and not self._looks_s
@@ -110,7 +111,7 @@ class Reach:
     def take_others(self) -> None:
         """Keep the ports that are written past from this process' next participant: it takes others."""
         for port in sorted(self._ports):
-            number, holders = int(port.rpartition("_port")[2]), _kept.setdefault(port, [])
+            number, holders = _number(port), _kept.setdefault(port, [])
             # The middleware numbers a participant by the first of its UDP ports that is free, which is even;
             # the port that is not numbered so is the first one whose lock is free.
             if number % 2:
@@ -149,18 +150,14 @@ def avoid_dead_ports() -> Iterator[list[str]]:
                 if (lock := _locked(port)) is not None:
                     dead[port] = stack.enter_context(lock)
             time.sleep(_PROBE_S)  # another that looks for a port may hold a dead one's lock for a moment
-        written: set[str] = set()
-        for other in Path("/proc").glob("[0-9]*/maps") if dead else ():
-            with contextlib.suppress(OSError):  # of another user, or gone meanwhile
-                written.update(_PORT.findall(other.read_text(errors="replace")))
-        for port in dead.keys() - written:
+        for port in dead.keys() - (_open_anywhere(_PORT) if dead else set()):
             dead.pop(port).close()
         for port, lock in dead.items():
             # Participants are numbered by the first of their UDP ports that is free, which is even; the ports
             # of that number need no lock, which would make them look alive to others.
-            if (holder := bound(int(port.rpartition("_port")[2]) & ~1)) is not None:
+            if (holder := bound(_number(port) & ~1)) is not None:
                 stack.enter_context(holder)
-                if int(port.rpartition("_port")[2]) >= _OF_DOMAINS:
+                if _number(port) >= _OF_DOMAINS:
                     lock.close()
         yield sorted(dead)
 
