@@ -718,16 +718,19 @@ def test_the_port_of_a_killed_process_is_avoided_as_long_as_others_write_to_it(p
             assert str(port) not in avoided, "nobody writes to it"
 
 
-def test_a_port_that_its_killed_maker_left_unmade_holds_nobody_up(domain: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("size", [0, 206_000], ids=["without a length", "without contents"])
+def test_a_port_that_its_killed_maker_left_unmade_holds_nobody_up(
+    domain: int, tmp_path: Path, size: int
+) -> None:
     unmade = Path(f"/dev/shm/fastrtps_port{ports_of(domain)[11]}")  # the first that a participant opens
-    unmade.write_bytes(bytes(206_000))
+    unmade.write_bytes(bytes(size))
     os.utime(unmade, (time.time() - 60.0,) * 2)
     fresh = unmade.with_name(f"{unmade.name}0")
-    fresh.write_bytes(bytes(206_000))
+    fresh.write_bytes(bytes(size))
     try:
         assert remove_unmade_ports() == [unmade]
         assert fresh.exists(), "it may be in the making"
-        unmade.write_bytes(bytes(206_000))
+        unmade.write_bytes(bytes(size))
         os.utime(unmade, (time.time() - 60.0,) * 2)
         with Graph({"composites": {}}, domain, tmp_path) as graph:
             deadline = time.monotonic() + 60
@@ -735,7 +738,20 @@ def test_a_port_that_its_killed_maker_left_unmade_holds_nobody_up(domain: int, t
                 assert time.monotonic() < deadline
                 time.sleep(0.05)
     finally:
-        fresh.unlink()
+        fresh.unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("size", [0, 206_000], ids=["without a length", "without contents"])
+def test_a_fork_server_removes_unmade_ports_as_all_nodes_may_wait_for_one(
+    domain: int, tmp_path: Path, size: int
+) -> None:
+    unmade = Path(f"/dev/shm/fastrtps_port{ports_of(domain)[11]}")
+    with start_fork_server(domain, tmp_path):
+        unmade.write_bytes(bytes(size))
+        deadline = time.monotonic() + 60
+        while unmade.exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
 
 
 def test_a_successor_takes_other_ports_than_the_killed_node_that_others_still_write_to(

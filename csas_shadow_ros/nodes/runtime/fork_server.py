@@ -21,15 +21,22 @@ import gc
 import importlib
 import json
 import os
+import select
 import signal
 import sys
 import time
 import traceback
+from collections.abc import Iterator
 from typing import Any
 
 from msg_adapters.messages import typestore
 
 from .base import CsasNode
+from .shared_memory import remove_unmade_ports
+
+#: A node may be killed while it makes a port, and all others wait for that within the middleware. This
+#: process opens none: it looks so often (s).
+_LOOK_S = 2.0
 
 
 def load(node: str) -> Any:
@@ -122,6 +129,19 @@ def _become(main: Any, node: str, arguments: list[str], log: str) -> None:
         os._exit(code)
 
 
+def _requests() -> Iterator[str]:
+    """Take lines from standard input as they come; remove unmade ports between them."""
+    with open(0, "rb", buffering=0, closefd=False) as lines:
+        while True:
+            ready, _, _ = select.select([lines], [], [], _LOOK_S)
+            if not ready:
+                remove_unmade_ports()
+            elif line := lines.readline():
+                yield line.decode()
+            else:
+                return
+
+
 def main() -> int:
     """Serve requests until there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -149,7 +169,7 @@ def main() -> int:
         # What cannot be loaded will be said to who asks for it.
         with contextlib.suppress(Exception):
             load(node)
-    for line in sys.stdin:
+    for line in _requests():
         if parent and os.getppid() != int(parent):
             break  # whoever asked is gone
         request = json.loads(line)

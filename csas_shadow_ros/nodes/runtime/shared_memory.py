@@ -16,6 +16,8 @@ from pathlib import Path
 _SEGMENTS, _OWNER = "/dev/shm/fastrtps_", "_el"
 #: How Boost's managed files begin, in this machine's order of bytes.
 _UNMADE, _IN_MAKING, _CORRUPT = (number.to_bytes(4, sys.byteorder) for number in (0, 1, 3))
+#: A file that its maker has not given a length yet.
+_EMPTY = b""
 #: Who makes a segment holds its lock within milliseconds: one so old that nobody holds is nobody's. Of other
 #: graphs' processes, which may be stopped just then, it is taken for certain only much later.
 LOCKED_S, LONG_LOCKED_S = 1.0, 60.0
@@ -112,14 +114,15 @@ def remove_ports(domain_id: int) -> None:
 def remove_unmade_ports() -> list[Path]:
     """Remove ports whose maker was killed before it had made them; return these.
 
-    Whoever opens such a file waits for ever for it to be made, within the middleware. Boost begins a file
-    with 0 or 1 until it is made, then with 2; at 3 whoever waits goes on, and makes it anew.
+    Whoever opens such a file waits for ever for it to be made, within the middleware. Boost makes it empty,
+    gives it its length, begins it with 0 or 1 until it is made, then with 2. At 3 whoever waits goes on, and
+    makes it anew.
     """
     removed = []
     for port in Path(_SEGMENTS).parent.glob(f"{Path(_SEGMENTS).name}port*[0-9]"):
         with contextlib.suppress(OSError), port.open("r+b") as file:
             old = time.time() - os.fstat(file.fileno()).st_mtime > LOCKED_S
-            if old and file.read(4) in (_UNMADE, _IN_MAKING):
+            if old and file.read(4) in (_EMPTY, _UNMADE, _IN_MAKING):
                 port.unlink()
                 file.seek(0)
                 file.write(_CORRUPT)
