@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import GeometryError, TrackError, check_range
-from ..frame_name import SCENE_FRAME
+from ..frame_name import SCENE_FRAME, check_frame
 from .frames import FloatArray, one_frame, wrap_angle
+from .pixels import positions_of, stamps_of
 from .track import Track
 
 IntArray = NDArray[np.int64]
@@ -54,8 +55,9 @@ class TrackPiece:
     frame: str = field(default=SCENE_FRAME, kw_only=True)
 
     def __post_init__(self) -> None:
-        stamps = np.asarray(self.stamps_ns, dtype=np.int64)
-        positions = np.asarray(self.positions_m, dtype=np.float64)
+        check_frame("piece of a track", self.frame)
+        stamps = stamps_of("piece of a track", self.stamps_ns)
+        positions = positions_of("piece of a track", self.positions_m)
         if stamps.ndim != 1 or not len(stamps) or positions.shape != (len(stamps), 3):
             raise TrackError(
                 f"piece of a track has stamps {stamps.shape} and positions {positions.shape}; expected (n,),"
