@@ -75,7 +75,8 @@ def reconstruct(
     Raises
     ------
     CsasError
-        If the run or an argument is not usable; also a ValueError or a TypeError.
+        If the run or an argument is not usable, as an image whose stamp the track does not cover; also a
+        ValueError or a TypeError.
 
     Examples
     --------

@@ -198,6 +198,35 @@ def test_a_track_leaves_its_makers_arrays_alone():
     assert np.array_equal(made.positions_m[0], PLACES[0])
 
 
+def reason_of(call):
+    with pytest.raises(csas.CsasError) as caught:
+        call()
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("off_s", [-3600, 3600])
+def test_an_image_that_no_track_covers_is_refused_in_the_words_of_run(off_s, tiny_box_bag, tmp_path):
+    image, track = tiny_box_bag.run.image, tiny_box_bag.run.track
+    stray = replace(image, stamp_ns=image.stamp_ns + off_s * 10**9)
+    told = reason_of(lambda: csas.reconstruct(csas.Run.of(stray, track)))
+    assert reason_of(lambda: csas.reconstruct(SimpleNamespace(image=stray, track=track))) == told
+    first, last = track.stamps_ns[[0, -1]]
+    assert f"no track covers its stamp: the track covers {first} to {last} ns" in told
+    csas.write_run(tmp_path / "stray", stray, track)
+    of_bag = reason_of(lambda: csas.process_bag(tmp_path / "stray", tmp_path / "out", figures=False))
+    fault = f": there is no full-circle image: {{}}image{{}} ({stray.stamp_ns} ns): no track covers its stamp"
+    assert told.startswith(f"in memory{fault.format('', '')}")
+    assert of_bag.startswith(f"{tmp_path / 'stray'}{fault.format('/csas/', ' message 0')}")
+    assert of_bag.partition("no track covers")[2] == told.partition("no track covers")[2]
+
+
+def test_an_image_of_the_circle_s_first_and_last_degrees_is_taken(tiny_box_bag):
+    image, track = tiny_box_bag.run.image, tiny_box_bag.run.track
+    step = int(track.stamps_ns[1] - track.stamps_ns[0])  # half a degree
+    for stamp in (track.stamps_ns[0] - 5 * step, track.stamps_ns[-1] + 5 * step, 0):
+        csas.Run.of(replace(image, stamp_ns=stamp), track)
+
+
 def test_anything_with_an_image_and_a_track_is_taken(tiny_box_bag):
     run = tiny_box_bag.run
     made = SimpleNamespace(image=run.image, track=run.track)

@@ -188,6 +188,13 @@ class TrackBook:
         #: What runs were called before an earlier pose of theirs came, and are called now.
         self.renamed: dict[int, int] = {}
 
+    @classmethod
+    def of(cls, track: Track) -> TrackBook:
+        """Make the book of a lone track."""
+        book = cls(max_poses=max(len(track), 3))
+        book.add(TrackPiece(track.stamps_ns, track.positions_m, frame=track.frame))
+        return book
+
     @property
     def names(self) -> tuple[int, ...]:
         """Names of the known runs (stamps of their first poses, ns), in time."""
@@ -256,6 +263,14 @@ class TrackBook:
         """Return the stamps of a run's first and last pose."""
         run = self._run(run_ns)
         return run.first, run.last
+
+    def not_covered(self, what: str = "its stamp") -> str:
+        """State that no track covers a stamp, and what the tracks cover."""
+        spans = [self.span(name) for name in self.names]
+        named = ", ".join(f"{first} to {last} ns" for first, last in spans[:4])
+        named += f" and {len(spans) - 4} more" if len(spans) > 4 else ""
+        tracks = "the track covers" if len(spans) == 1 else "the tracks cover"
+        return f"no track covers {what}: {tracks} {named}"
 
     def track(self, run_ns: int) -> Track:
         """Return all poses of a run; the same object until another piece arrives.
