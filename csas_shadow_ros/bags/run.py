@@ -46,7 +46,7 @@ from msg_adapters.topics import (
 )
 from msg_adapters.track import track_to_msg
 
-from .bag import BagReader, BagWriter
+from .bag import BagReader, whole_bag
 from .pairs import Problem, checked_messages, iterate_pairs
 from .tracks import BagRuns
 
@@ -468,6 +468,8 @@ def write_run(
 ) -> Path:
     """Write a run as a rosbag2 directory that any ROS 2 tool can open.
 
+    The directory is there once it is whole: if anything fails, what was there before stays as it was.
+
     Parameters
     ----------
     path : path-like
@@ -530,7 +532,7 @@ def write_run(
     def name(relative: str) -> str:
         return absolute_name(relative, namespace)
 
-    with BagWriter(path, compress=compress, overwrite=overwrite) as writer:
+    with whole_bag(path, compress=compress, overwrite=overwrite) as writer:
         for latched in ("image", "camera_info", "track"):
             if track if latched == "track" else image:
                 writer.add_topic(name(latched), TOPICS[latched].type_name, depth=1)
