@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 from .errors import ParameterError
+from .methods import METHODS, Method, method_named
 
 if TYPE_CHECKING:
     from .geometry.place import Datum
@@ -29,7 +30,6 @@ Taper = Literal["none", "tukey", "taylor"]
 Enhancement = Literal["exact", "small_angle", "none"]
 Background = Literal["local", "global"]
 ShadowLevel = Literal["estimated", "contrast"]
-Method = Literal["consensus", "hard", "soft"]
 TargetChoice = Literal["auto", "given"]
 
 
@@ -226,7 +226,7 @@ class CarvingParameters(Parameters):
     method: Method = bounded(
         "consensus",
         "carve by silhouettes that few (consensus) or no views (hard) contradict, or by mean l_out (soft)",
-        choices=get_args(Method),
+        choices=tuple(METHODS),
     )
     voxel_size_m: float = bounded(0.02, "set the edge of a voxel", low=1e-4, high=1e3, unit="m")
     threshold: float = bounded(
@@ -246,11 +246,11 @@ class CarvingParameters(Parameters):
     @property
     def takes_masks(self) -> bool:
         """Whether the method carves with segmented silhouettes rather than likelihoods."""
-        return self.method != "soft"
+        return method_named(self.method).takes_masks
 
     def other(self) -> CarvingParameters:
         """Return the same parameters for the other kind of method, with its automatic threshold."""
-        return dataclasses.replace(self, method="soft" if self.takes_masks else "hard", threshold=0.0)
+        return dataclasses.replace(self, method=method_named(self.method).other, threshold=0.0)
 
 
 @dataclass(frozen=True)

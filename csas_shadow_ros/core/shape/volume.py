@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import GeometryError, InputTypeError, check_numbers, check_range, check_type, check_whole, shown
+from ..methods import method_named
 
 if TYPE_CHECKING:
     from .seabed import SeabedSlope
@@ -143,7 +144,7 @@ class VoxelGrid:
     occupied : ndarray of bool, shape (nz, ny, nx)
         The object's voxels.
     method : str
-        How the voxels were carved.
+        How the voxels were carved: a name of `core.methods.METHODS`.
     seabed : SeabedSlope, optional
         How the seabed seems to slope; where that is believed, the grid was carved over it.
     """
@@ -158,6 +159,7 @@ class VoxelGrid:
 
     def __post_init__(self) -> None:
         check_type("volume of the grid", self.volume, Volume, "a Volume")
+        method_named(self.method)
         for name, kind in (("likelihood", np.floating), ("views", np.number), ("occupied", np.bool_)):
             values = getattr(self, name)
             check_type(f"{name} of the grid", values, np.ndarray, "an array of numpy")
