@@ -13,11 +13,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from ..core import errors
 from ..core.errors import CsasError, NoTargetError, ParameterError
-from ..core.parameters import MAX_OBJECTS, PipelineParameters
+from ..core.parameters import MAX_OBJECTS, PipelineParameters, Stage
+from ..node_table import chain, joins, makers
 from ..nodes.runtime.params import NODES, check
 from .processes import (
     MAX_DOMAIN_ID,
@@ -43,23 +44,8 @@ if TYPE_CHECKING:
     from ..core.shape.result import Result
     from ..core.shape.volume import Target, VoxelGrid
 
-#: Stages of a bag, and the nodes that turn each into the next.
-_CHAIN = {
-    "image": ("sub_aperture", "shadow_enhancement", "shadow_likelihood", "voxel_carver"),
-    "sector": ("sub_aperture", "shadow_enhancement", "shadow_likelihood", "voxel_carver"),
-    "sub_aperture": ("shadow_enhancement", "shadow_likelihood", "voxel_carver"),
-    "shadow": ("shadow_likelihood", "voxel_carver"),
-    "likelihood": ("voxel_carver",),
-    "shadow_mask": ("voxel_carver",),
-}
 #: Who may have refused a view before it is in a stream.
-_STAGES_BEFORE: dict[str, tuple[str, ...]] = {
-    "sub_aperture": (),
-    "shadow": ("shadow_enhancement",),
-    "likelihood": ("shadow_enhancement", "shadow_likelihood"),
-    "shadow_mask": ("shadow_enhancement", "shadow_likelihood"),
-}
-_WITH_COMPOSITES = ("image", "sector", "sub_aperture")
+_STAGES_BEFORE = {stage: makers(stage) for stage in get_args(Stage)}
 #: How often every node is heard (`nodes.base.BEAT_S`).
 BEAT_S = 0.5
 #: What is published already comes within a second, on a busy machine in some.
@@ -540,8 +526,8 @@ def _node_plan(
     window: int,
     overrides: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, dict[str, Any]]:
-    plan: dict[str, dict[str, Any]] = {name: of_stage[name] for name in _CHAIN[stage]}
-    if composites and stage in _WITH_COMPOSITES:
+    plan: dict[str, dict[str, Any]] = {name: of_stage[name] for name in chain(stage)}
+    if composites and joins("composites", stage):
         plan["composites"] = {}
     # Figure 8 compares the methods.
     plan["voxel_carver"] |= {"compare": stage not in ("likelihood", "shadow_mask")}
