@@ -121,6 +121,13 @@ class Outside:
     def stamps(self) -> list[str]:
         return [s for s in re.findall(r"^([\d.]{10,}) ", self.log.read_text(), re.MULTILINE)]
 
+    def over(self) -> list[str]:
+        """Names of the runs that it says are over, each after the last view."""
+        lines = self.log.read_text().splitlines()
+        told = [n for n, line in enumerate(lines) if line.startswith("the run of ")]
+        assert all(n >= VIEWS for n in told)
+        return [lines[n].split()[3] for n in told]
+
     def got(self, views: int) -> Callable[[], bool]:
         return lambda: len(set(self.stamps())) >= views
 
@@ -189,6 +196,8 @@ def test_the_graph_completes_where_there_is_no_classifier_and_one_that_comes_aft
     for one in late:
         graph.until(one.got(VIEWS), "a late classifier has every view")
         assert len(one.stamps()) == VIEWS, "each once"
+    graph.until(lambda: graph.carved() == VIEWS and bool(late[0].over()), "it learns that the run is over")
+    assert late[0].over() == [str(graph.measurements.run_ns)]
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.5])
