@@ -22,28 +22,40 @@ class NodeEntry:
         Streams of views that it makes of them.
     beside : bool
         Whether the run goes on to its end without it.
+    needed : str
+        Why a replay cannot leave it out; empty: it can, as an outside node may take its place.
     """
 
     name: str
     takes: tuple[str, ...] = ()
     gives: tuple[str, ...] = ()
     beside: bool = False
+    needed: str = ""
 
 
 #: First those that have most to do before there is a view.
 NODES = {
     node.name: node
     for node in (
-        NodeEntry("bag_player", beside=True),
-        NodeEntry("sub_aperture", ("image", "sector"), ("sub_aperture",)),
+        NodeEntry("bag_player", beside=True, needed="it plays the bag"),
+        NodeEntry(
+            "sub_aperture",
+            ("image", "sector"),
+            ("sub_aperture",),
+            needed="it decides what is carved, and sends every view until all have it",
+        ),
         NodeEntry("shadow_enhancement", ("sub_aperture",), ("shadow",)),
         NodeEntry("shadow_likelihood", ("shadow",), ("likelihood", "shadow_mask")),
-        NodeEntry("voxel_carver", ("likelihood", "shadow_mask")),
+        NodeEntry("voxel_carver", ("likelihood", "shadow_mask"), needed="its grid is the result"),
         NodeEntry("composites", ("sub_aperture",), beside=True),
-        NodeEntry("bag_recorder", beside=True),
-        NodeEntry("viewer", beside=True),
+        NodeEntry("bag_recorder", beside=True, needed="the results are made of its bag"),
+        NodeEntry("viewer", beside=True, needed="only --view starts it"),
     )
 }
+
+
+#: What a replay can leave out.
+REPLACEABLE = tuple(name for name, node in NODES.items() if not node.needed)
 
 
 def chain(stream: str) -> tuple[str, ...]:

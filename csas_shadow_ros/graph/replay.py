@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any, get_args
 from ..core import errors
 from ..core.errors import CsasError, NoTargetError, ParameterError
 from ..core.parameters import MAX_OBJECTS, PipelineParameters, Stage
-from ..node_table import chain, joins, makers
+from ..node_table import NODES as _NODES
+from ..node_table import REPLACEABLE, chain, joins, makers
 from ..nodes.runtime.params import NODES, check
 from .processes import (
     MAX_DOMAIN_ID,
@@ -384,6 +385,7 @@ def replay(
     max_restarts: int = 3,
     stall_timeout_s: float = 180.0,
     beside: Mapping[str, Mapping[str, Any]] | None = None,
+    without: Iterable[str] = (),
 ) -> ReplayResult:
     """Replay a bag through the node graph and return what it leaves.
 
@@ -424,6 +426,8 @@ def replay(
         Give up when nothing at all has changed for so long.
     beside : mapping of node name to mapping, optional
         Further nodes, with their parameters, that only look on: `viewer`.
+    without : iterable of str
+        Nodes of `REPLACEABLE` that are not started, as an outside node in this domain takes their place.
 
     Raises
     ------
@@ -441,7 +445,10 @@ def replay(
         recording = None if record is False else out / "recording" if record is True else Path(record)
         chosen, decision = _plan(bag, stage, p, namespace)
         of_stage = node_parameters(p, None if decision is None else decision.target, max_objects)
+        without = leave_out(without, chosen)
+        composites = composites and "composites" not in without
         plan = _node_plan(bag, chosen, of_stage, rate, recording, composites, window, overrides or {})
+        plan = {name: own for name, own in plan.items() if name not in without}
         plan["bag_player"]["bag_namespace"] = namespace or ""
         plan |= {name: dict(own) for name, own in (beside or {}).items()}
         check(plan)
@@ -461,6 +468,34 @@ def replay(
         if recording is not None:
             result.not_recorded = _finish_recording(recording, graph, watcher, result, set(messages))
     return result
+
+
+def leave_out(names: Iterable[str], stage: str) -> frozenset[str]:
+    """Return the nodes that a replay does not start.
+
+    Parameters
+    ----------
+    names : iterable of str
+        The nodes.
+    stage : str
+        What is played.
+
+    Raises
+    ------
+    ParameterError
+        If one is unknown, cannot be left out, or would not be started anyway.
+    """
+    left = frozenset(names)
+    for name in sorted(left):
+        if name not in _NODES:
+            raise ParameterError(f"without is {name!r}; expected one of: {', '.join(REPLACEABLE)}")
+        if why := _NODES[name].needed:
+            raise ParameterError(
+                f"a replay cannot do without {name}: {why}; expected one of: {', '.join(REPLACEABLE)}"
+            )
+        if not joins(name, stage):
+            raise ParameterError(f"without is {name!r}, but {stage} views do not pass it; expected none such")
+    return left
 
 
 @contextlib.contextmanager
@@ -740,7 +775,13 @@ def _not_recorded(
         if name not in kept:
             continue
         stages = _STAGES_BEFORE[name]
-        refused = {view.stamp_ns for view in result.rejected if view.node in stages}
+        # In the place of a node that was left out somebody else's may have refused it.
+        replaced = not result.nodes.keys() >= set(stages)
+        refused = {
+            view.stamp_ns
+            for view in result.rejected
+            if view.node in stages or (replaced and view.node not in _NODES)
+        }
         wanted = result.views_total - len(refused)
         held = min(count(f"{name}/image"), count(f"{name}/camera_info"))
         if held < wanted:

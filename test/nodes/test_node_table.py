@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,9 @@ from pathlib import Path
 import pytest
 
 from csas_shadow_ros import security
+from csas_shadow_ros.cli.main import main
+from csas_shadow_ros.core.errors import ParameterError
+from csas_shadow_ros.graph.replay import leave_out
 from csas_shadow_ros.node_table import NODES, chain, joins, makers
 from csas_shadow_ros.nodes.runtime import params, start
 from msg_adapters.topics import STREAMS, VIEW_STREAMS
@@ -55,6 +59,38 @@ def test_every_stream_leads_to_the_grid_through_who_makes_the_next(stream):
     assert stream not in VIEW_STREAMS or (*makers(stream), *names) == chain("sub_aperture") or (
         stream in ("likelihood", "shadow_mask")
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "stage", "reason"),
+    [
+        ("carver", "image", "without is 'carver'; expected one of: shadow_enhancement, shadow_likelihood"),
+        ("voxel_carver", "image", "cannot do without voxel_carver: its grid is the result; expected one of"),
+        ("sub_aperture", "sector", "cannot do without sub_aperture: it decides what is carved"),
+        ("bag_player", "image", "cannot do without bag_player: it plays the bag"),
+        ("bag_recorder", "image", "cannot do without bag_recorder: the results are made of its bag"),
+        ("viewer", "image", "cannot do without viewer: only --view starts it"),
+        ("shadow_enhancement", "shadow", "'shadow_enhancement', but shadow views do not pass it"),
+        ("composites", "likelihood", "'composites', but likelihood views do not pass it"),
+    ],
+)
+def test_a_node_that_a_replay_cannot_leave_out_is_named_with_the_reason(name, stage, reason):
+    with pytest.raises(ParameterError, match=re.escape(reason)):
+        leave_out([name], stage)
+
+
+def test_a_replay_leaves_out_what_may_be_replaced():
+    assert leave_out(["composites", "shadow_likelihood"], "image") == {"composites", "shadow_likelihood"}
+
+
+def test_a_replay_without_a_node_that_it_needs_ends_in_one_line(tiny_box_bag, tmp_path, capsys):
+    pytest.importorskip("rclpy")
+    out = tmp_path / "out"
+    command = ["replay", str(tiny_box_bag.path), "--out", str(out), "--without", "voxel_carver"]
+    assert main(command) == 1
+    told = capsys.readouterr().err.strip().splitlines()
+    assert "cannot do without voxel_carver: its grid is the result" in told[-1]
+    assert not out.exists()
 
 
 def test_the_table_is_read_without_any_library():
