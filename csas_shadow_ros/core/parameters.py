@@ -2,6 +2,13 @@
 
 The same dataclasses drive the in-process pipeline, the ROS parameter descriptors, the YAML file and
 the table of docs/parameters.md. Users meet degrees here (``_deg``); the code behind works in radians.
+
+Why no pydantic or msgspec: they would take over the checks of a value, some 70 lines of this file.
+Descriptors with units, the ROS YAML file, options and tables would still be made of each field's metadata
+as now, and errors still be put into the words of the package. Importing pydantic 2 takes 0.2 s and
+msgspec 0.07 s, where dataclasses take 0.02 s (two busy cores, best of 7: ``python -c "from pydantic
+import BaseModel, Field"`` less ``python -c pass``), in each node that starts by itself, as all do under
+``ros2 launch``.
 """
 
 from __future__ import annotations
