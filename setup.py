@@ -1,22 +1,15 @@
 """Packaging: colcon (ament_python), pip and ``ros2 run`` all install the package from here."""
 
 import os
+import runpy
 import sys
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
 NAME = "csas_shadow_ros"
-NODES = (
-    "sub_aperture",
-    "shadow_enhancement",
-    "shadow_likelihood",
-    "voxel_carver",
-    "composites",
-    "bag_player",
-    "bag_recorder",
-    "viewer",
-)
+#: Names of the nodes: from the package's own table, which needs nothing that is not installed yet.
+NODES = tuple(runpy.run_path(str(Path(__file__).resolve().parent / NAME / "node_table.py"))["NODES"])
 
 # Floors are what Ubuntu 24.04 has beside ROS 2 Jazzy (constraints/noble.txt), and were tried.
 CORE = [

@@ -10,7 +10,7 @@ import threading
 import time
 import traceback
 import uuid
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +19,7 @@ import rclpy
 from numpy.typing import NDArray
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.serialization import deserialize_message
 from rclpy.signals import uninstall_signal_handlers
 
 from csas_shadow_ros.core.errors import CsasError, ParameterError
@@ -26,9 +27,12 @@ from csas_shadow_ros.core.geometry import View, ViewInfo, looks_at
 from csas_shadow_ros.core.imaging.masks import MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from msg_adapters import (
     VIEW_STREAMS,
+    Heartbeat,
     RclpyMessages,
     TargetBox,
     ViewProgress,
+    is_routine_report,
+    progress_from_msg,
     progress_to_msg,
     stamp_to_ns,
     target_from_msg,
@@ -42,10 +46,13 @@ from .nodes import qos
 from .nodes.runtime.base import BEAT_S, Inlet, ViewOutlet
 from .nodes.runtime.flow import place_of
 from .nodes.runtime.hearing import Reach, avoid_dead_ports
+from .nodes.runtime.pace import Growing
 
 #: What a callback gives back: nothing, the pixels of its result, or in words why it cannot use the view.
 Answer = NDArray[Any] | str | None
 Callback = Callable[[NDArray[Any], ViewInfo], Answer]
+#: Streams whose sources know when every view is through; of an image or sectors they are before the views.
+_VIEWS = frozenset(VIEW_STREAMS)
 _LONELY_S = 5.0
 _STOP_S = 0.05
 #: Outcomes that are remembered, for views that come twice: days of views, a few MB.
@@ -113,6 +120,11 @@ class ViewSubscriber:
         too. It must return the result's pixels then (of a bool mask True is shadow, and unknown is where the
         view is NaN), and its node takes the place of the stage that makes this stream. By default a view
         ends here.
+    on_finished : callable, optional
+        Called, in the callback's thread and after its last view, once a run is over: the source says that
+        every view has been through, or has been silent for so long that a result counts as final. It takes
+        the run's name, the stamp (ns) of its track's first pose; None where the source knows no track. If a
+        view of the run comes after all, it is called again once that is through.
 
     Raises
     ------
@@ -138,7 +150,15 @@ class ViewSubscriber:
     >>> rclpy.shutdown()
     """
 
-    def __init__(self, node: Any, stream: str, callback: Callback, *, results: str | None = None) -> None:
+    def __init__(
+        self,
+        node: Any,
+        stream: str,
+        callback: Callback,
+        *,
+        results: str | None = None,
+        on_finished: Callable[[int | None], None] | None = None,
+    ) -> None:
         if stream not in VIEW_STREAMS:
             raise ParameterError(f"stream is {stream!r}; expected one of: {', '.join(VIEW_STREAMS)}")
         later = [name for name in VIEW_STREAMS if place_of(name) > place_of(stream)]
@@ -157,12 +177,19 @@ class ViewSubscriber:
         self._known: OrderedDict[tuple[Any, ...], tuple[str, str]] = OrderedDict()
         self._working_on: tuple[Any, ...] = ()
         self._closed = False
+        self._on_finished = on_finished
+        self._run: int | None = None
+        self._over: deque[int | None] = deque()
+        # As every sink of the package: it says when what there is is final.
+        self._growing = Growing(self._run_is_over, lambda: False, 0.0)
         # The outlet before the inlet: what comes in can go out.
         self._results = results
         self._outlet = None if results is None else ViewOutlet(self._host, results)
         self._host.subscribe("target", qos.LATCHED, self._take_target)
         role = "sink" if results is None else "stage"
         self._inlet = Inlet(self._host, stream, role, self._enqueue)
+        if on_finished is not None:
+            self._host.subscribe("progress", qos.REPORTS, self._take_progress, raw=True)
         self._worker = threading.Thread(target=self._work, name=f"{stream} callback", daemon=True)
         self._worker.start()
         self._host.start()
@@ -193,6 +220,39 @@ class ViewSubscriber:
         self._target = target_from_msg(msg)
         self._host.target_stamp = str(stamp_to_ns(msg.header.stamp, "target.header.stamp"))
 
+    def _take_progress(self, cdr: bytes) -> None:
+        """Note what a source of views says of the run's end."""
+        if is_routine_report(cdr):
+            return
+        kind = self._host.messages.cls(topic_of("progress").type_name)
+        beat = progress_from_msg(deserialize_message(cdr, kind))
+        if not isinstance(beat, Heartbeat) or beat.role != "source":
+            return
+        if beat.values.get("stream") not in _VIEWS:
+            return
+        # Nobody waits for a stage itself: it has passed everything on once all behind it are done.
+        ended = self._inlet.instance in beat.values.get("finished_for", "").split()
+        ended |= self._outlet is not None and bool(beat.counts.get("finished"))
+        name = beat.values.get("run", "")
+        with self._wake:
+            run = int(name) if name.isdecimal() else None
+            if run != self._run:
+                self._growing.begin_again()
+                self._run = run
+            self._growing.source_says(ended)
+            self._growing.tick(time.monotonic())
+
+    def _run_is_over(self) -> None:
+        """Have the callback's thread tell that the run is over, after the views that wait."""
+        if self._growing.final:
+            self._over.append(self._run)
+            self._wake.notify()
+
+    def _has_changed(self) -> None:
+        with self._wake:
+            self._growing.changed()
+            self._growing.source_says(False)  # what it said before did not count this view
+
     def _enqueue(self, image: Any, info: Any) -> None:
         """Keep a view for the callback: a window of them at most, the newer one of two copies."""
         with self._wake:
@@ -207,16 +267,31 @@ class ViewSubscriber:
     def _work(self) -> None:
         while True:
             with self._wake:
-                self._wake.wait_for(lambda: self._waiting or self._closed)
+                self._wake.wait_for(lambda: self._waiting or self._over or self._closed)
                 if self._closed:
                     return
-                stamp, (image, info) = self._waiting.popitem(last=False)
+                over = not self._waiting
+                if over:
+                    run = self._over.popleft()
+                else:
+                    stamp, (image, info) = self._waiting.popitem(last=False)
+            if over:
+                self._tell_the_end(run)
+                continue
             try:
                 self._work_on(stamp, image, info)
             except (InvalidHandle, RuntimeError) as error:
                 if not self._host.node.context.ok():
                     return  # shut down under us: nobody hears it any more
                 self._host.reject(f"{type(error).__name__}: {error}")
+
+    def _tell_the_end(self, run: int | None) -> None:
+        try:
+            if self._on_finished is not None:
+                self._on_finished(run)
+        except Exception as error:
+            # The run is over all the same, and the next one's views are to be taken.
+            self._host.node.get_logger().error("".join(traceback.format_exception(error)))
 
     def _work_on(self, stamp: int, image: Any, info: Any) -> None:
         # The same stamp with another camera or focus is another view: of a target that has moved.
@@ -228,6 +303,8 @@ class ViewSubscriber:
             self._host.counts["duplicates"] += 1
         if known is None:
             return
+        if key not in self._known:
+            self._has_changed()
         self._known[key] = known
         if len(self._known) > _REMEMBERED:
             self._known.popitem(last=False)
@@ -279,6 +356,8 @@ class ViewSubscriber:
     # In the heartbeats' thread
 
     def _look(self, age_s: float) -> None:
+        with self._wake:
+            self._growing.tick(time.monotonic())
         if self._reach.is_lost():
             self._host.unable = DEAF  # nobody waits for it for long
             self._host.node.get_logger().error(DEAF)

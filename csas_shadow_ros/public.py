@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-import operator
 import os
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from .bags import Run
-from .core.errors import InputTypeError, ParameterError, check_range, check_type
+from .core.errors import InputTypeError, ParameterError, check_type, check_whole
 from .core.geometry import CoherentImage, Track
 from .core.parameters import MAX_OBJECTS, MOST_OBJECTS, PipelineParameters, StartFrom
 from .core.pipeline import Result
@@ -76,7 +75,8 @@ def reconstruct(
     Raises
     ------
     CsasError
-        If the run or an argument is not usable; also a ValueError or a TypeError.
+        If the run or an argument is not usable, as an image whose stamp the track does not cover; also a
+        ValueError or a TypeError.
 
     Examples
     --------
@@ -105,8 +105,8 @@ def reconstruct(
             parameters or PipelineParameters(),
             start_from=start_from,
             spectrum_sign=spectrum_sign,
-            workers=_whole("workers", workers, _MOST_WORKERS),
-            max_objects=_whole("max_objects", max_objects, MOST_OBJECTS),
+            workers=check_whole("workers", workers, 1, _MOST_WORKERS),
+            max_objects=check_whole("max_objects", max_objects, 1, MOST_OBJECTS),
             progress=bar,
             notice=_say,
         )
@@ -148,15 +148,6 @@ def parameters(file: str | Path | None = None, **values: Any) -> PipelineParamet
     if "position_m" in chosen and "target" not in chosen:
         chosen["target"] = "given"  # a position is given for no other purpose
     return pipeline_parameters(chosen)
-
-
-def _whole(name: str, value: int, most: int) -> int:
-    try:
-        number = operator.index(value)
-    except TypeError:
-        raise InputTypeError(f"{name} is {value!r}; expected a whole number") from None
-    check_range(name, number, 1, most)
-    return number
 
 
 def _say(line: str) -> None:

@@ -163,6 +163,7 @@ def replay_bag(
     progress: Progress | None = None,
     notice: Notice = ignore,
     viewer_port: int | None = None,
+    without: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Reconstruct the target of a bag through the node graph and write the same results folder.
 
@@ -177,6 +178,8 @@ def replay_bag(
         ROS domain, to look on with other tools; a free one otherwise.
     viewer_port : int, optional
         Show the graph in the operator's page, at this port of this machine.
+    without : sequence of str
+        Nodes that are not started, as a node of your own takes their place: see `graph.replay.replay`.
 
     Returns
     -------
@@ -219,6 +222,7 @@ def replay_bag(
             progress=progress or False,
             notice=notice,
             beside=None if viewer_port is None else _viewer(viewer_port, p),
+            without=without,
         )
         _take_replay(context, replayed, run, image)
         result = adopt_replay(writer, replayed, p, whole=rate == 0.0)

@@ -1,4 +1,4 @@
-"""An outside classifier in ten lines: told of every view, however slow it is (docs/classifier.md)."""
+"""An outside classifier in a few lines: told of every view, however slow it is (docs/classifier.md)."""
 
 import math
 import sys
@@ -19,7 +19,12 @@ def classify(pixels, info):
     print(f"{info.stamp_ns} {math.degrees(info.aspect_rad):6.1f}° {dark:4.0%} dark", flush=True)
 
 
+def finished(run_ns):
+    """Say that every view of a run has been classified: the place for the verdict on the contact."""
+    print(f"the run of {run_ns} ns is over", flush=True)
+
+
 rclpy.init()
 node = create_node("classifier", namespace="csas")
-with ViewSubscriber(node, "shadow", classify):
+with ViewSubscriber(node, "shadow", classify, on_finished=finished):
     spin(node)

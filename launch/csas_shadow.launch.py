@@ -32,10 +32,11 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
+from csas_shadow_ros.node_table import chain
 from launch import LaunchDescription
 
 PACKAGE, FILE = "csas_shadow_ros", "csas_shadow.launch.py"
-STAGES = ("sub_aperture", "shadow_enhancement", "shadow_likelihood", "voxel_carver")
+STAGES = chain("image")
 #: What a node exits with when it refuses its parameters, a bag among them.
 REFUSED = 2
 SHARE = FindPackageShare(PACKAGE)

@@ -11,6 +11,7 @@ import numpy as np
 
 from csas_shadow_ros.core.errors import AdapterError, CsasError
 from csas_shadow_ros.core.geometry import SCENE_FRAME, Datum, Place
+from csas_shadow_ros.core.methods import METHODS
 from csas_shadow_ros.core.shape.mesh import Dimensions
 from csas_shadow_ros.core.shape.result import QUALITIES, VERDICTS, LeftOut, ObjectResult, Quality, Result
 from csas_shadow_ros.core.shape.seabed import SeabedSlope
@@ -378,7 +379,7 @@ def _grid_of(status: Status) -> GridFacts:
         gx, gy = status.reals("seabed_gradient_x", "seabed_gradient_y", finite=True)
         about_x, about_y = status.reals("seabed_about_x_m", "seabed_about_y_m", finite=True)
         seabed = SeabedSlope((gx, gy), status.real("seabed_sigma"), (about_x, about_y))
-    return GridFacts(status.text("method"), status.real("threshold"), (x, y, z), size, seabed)
+    return GridFacts(status.text("method", tuple(METHODS)), status.real("threshold"), (x, y, z), size, seabed)
 
 
 def _object_of(number: int, status: Status) -> MeasuredObject:

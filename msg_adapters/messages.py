@@ -16,12 +16,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from csas_shadow_ros.core.errors import AdapterError
+from csas_shadow_ros.core.errors import MAX_STAMP_NS, AdapterError
 from csas_shadow_ros.core.frame_name import SCENE_FRAME as SCENE_FRAME
+from csas_shadow_ros.core.frame_name import is_frame
 
 NANOSECONDS = 1_000_000_000
-#: ``builtin_interfaces/Time.sec`` is an int32.
-MAX_STAMP_NS = (1 << 31) * NANOSECONDS - 1
 
 #: Defaults that are not zero or empty in the common interfaces.
 _DEFAULTS: dict[str, dict[str, Any]] = {
@@ -465,10 +464,6 @@ def make_header(factory: MessageFactory, stamp_ns: int) -> Any:
     return factory.make("std_msgs/msg/Header", stamp=stamp, frame_id=factory.frame_id)
 
 
-#: tf2 and REP 103 set no limit; a name fits a line of the terminal with what was expected.
-_MAX_FRAME = 100
-
-
 def frame_of(msg: Any, where: str, expected: str = "") -> str:
     """Return the frame of a message.
 
@@ -487,7 +482,7 @@ def frame_of(msg: Any, where: str, expected: str = "") -> str:
         If it has none, or another one; the error names it.
     """
     frame = msg.header.frame_id
-    if not isinstance(frame, str) or not frame.strip() or len(frame) > _MAX_FRAME:
+    if not is_frame(frame):
         raise AdapterError(
             f"{where}.header.frame_id is {quoted(frame)}; expected the name of the scene's frame, such as"
             f" {SCENE_FRAME!r}"

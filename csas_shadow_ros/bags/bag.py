@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import tempfile
 import weakref
@@ -17,6 +18,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.serde import SerdeError
 
 from csas_shadow_ros.core.errors import AdapterError, BagError
+from csas_shadow_ros.durable import Place
 from msg_adapters.messages import message_from_cdr, stamp_to_ns, type_name_of, typestore
 from msg_adapters.topics import NAMESPACE, STREAMS, TOPICS, VIEW_STREAMS, absolute_name, clean_namespace
 
@@ -396,6 +398,59 @@ class _Channel:
     count: int = 0
 
 
+def _check_room(path: Path, overwrite: bool) -> None:
+    """Refuse to write a bag where something is that is not to be replaced."""
+    if not path.exists():
+        return
+    if not overwrite:
+        raise BagError(f"{path} exists already; expected a new directory, or overwrite")
+    inside = list(path.iterdir()) if path.is_dir() else None
+    if inside is None or any(p.name != METADATA and p.suffix not in (".mcap", ".db3") for p in inside):
+        raise BagError(f"{path} exists and is not a bag: not replaced")
+
+
+@contextlib.contextmanager
+def whole_bag(path: str | Path, *, compress: bool = True, overwrite: bool = False) -> Iterator[BagWriter]:
+    """Write a bag that is in place once it is whole: whatever fails before leaves what was there.
+
+    Parameters
+    ----------
+    path : path-like
+        Directory to make.
+    compress, overwrite
+        See `BagWriter`.
+
+    Raises
+    ------
+    BagError
+        If the path is taken or cannot be made.
+    """
+    # Of a link, what it leads to is replaced.
+    folder = Path(path).resolve()
+    _check_room(folder, overwrite)
+    place = Place(folder)
+    place.clear(lambda _: None)
+    try:
+        with _named(path):
+            work = place.make()
+        name = f"{folder.name}_0.mcap"
+        with BagWriter(work, compress=compress, overwrite=True, file_name=name) as writer:
+            yield writer
+        with _named(path):
+            place.put(replace=overwrite, durable=False)
+    finally:
+        place.abandon()
+
+
+@contextlib.contextmanager
+def _named(path: str | Path) -> Iterator[None]:
+    """Turn what the disk says into an error that names the bag."""
+    try:
+        yield
+    except OSError as error:
+        raise BagError(f"cannot make {path}: {error.strerror}") from error
+
+
 class BagWriter:
     """Writes a rosbag2 directory: one MCAP file with checksums and definitions, and its metadata.
 
@@ -434,10 +489,11 @@ class BagWriter:
         self._first: int | None = None
         self._last = 0
         self._closed = False
-        if self.path.exists():
-            self._make_room(overwrite)
+        _check_room(self.path, overwrite)
         try:
-            self.path.mkdir(parents=True)
+            if overwrite and self.path.exists() and any(self.path.iterdir()):
+                shutil.rmtree(self.path)
+            self.path.mkdir(parents=True, exist_ok=overwrite)
             self.file = self.path / (file_name or f"{self.path.resolve().name}_0.mcap")
             self._stream = self.file.open("wb")
         except OSError as error:
@@ -445,14 +501,6 @@ class BagWriter:
         kinds = {True: CompressionType.ZSTD, False: CompressionType.NONE, "lz4": CompressionType.LZ4}
         self._writer: Any = Writer(self._stream, compression=kinds[compress])
         self._writer.start(profile="ros2", library="csas_shadow_ros")
-
-    def _make_room(self, overwrite: bool) -> None:
-        if not overwrite:
-            raise BagError(f"{self.path} exists already; expected a new directory, or overwrite")
-        inside = list(self.path.iterdir()) if self.path.is_dir() else None
-        if inside is None or any(p.name != METADATA and p.suffix not in (".mcap", ".db3") for p in inside):
-            raise BagError(f"{self.path} exists and is not a bag: not replaced")
-        shutil.rmtree(self.path)
 
     def __enter__(self) -> BagWriter:
         return self

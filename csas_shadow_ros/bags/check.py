@@ -15,6 +15,7 @@ import numpy as np
 
 from csas_shadow_ros.core.errors import BagError, CsasError, check_type
 from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, Track, View
+from csas_shadow_ros.core.geometry.pixels import check_finite_pixels
 from msg_adapters.camera_info import SectorInfo
 from msg_adapters.pairs import (
     coherent_image_from_msgs,
@@ -461,7 +462,14 @@ def _not_round(track: Track) -> str:
 
 
 def judge_image(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, str]]:
-    """Yield (level, problem, remedy) for contradictions between image, camera_info and track."""
+    """Yield (level, problem, remedy) for contradictions between image, camera_info and track.
+
+    Raises
+    ------
+    ParameterError
+        If a pixel is not finite, though it was when the image was made.
+    """
+    check_finite_pixels("image", image.pixels)
     if track.frame != image.frame:
         yield (
             ERROR,

@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from csas_shadow_ros.core.errors import BagError, CsasError, check_type
-from csas_shadow_ros.core.geometry import CoherentImage, Datum, GroundGrid, GroundLattice, Origin, Track, View
+from csas_shadow_ros.core.geometry import (
+    CoherentImage,
+    Datum,
+    GroundGrid,
+    GroundLattice,
+    Origin,
+    Track,
+    TrackBook,
+    View,
+)
 from csas_shadow_ros.core.sectors.sector import Sector, scene_of, unfit, unlike
 from msg_adapters.camera_info import SectorInfo, sector_info_from_msg
 from msg_adapters.image import largest_part, quantise
@@ -37,7 +46,7 @@ from msg_adapters.topics import (
 )
 from msg_adapters.track import track_to_msg
 
-from .bag import BagReader, BagWriter
+from .bag import BagReader, whole_bag
 from .pairs import Problem, checked_messages, iterate_pairs
 from .tracks import BagRuns
 
@@ -49,6 +58,7 @@ T = TypeVar("T")
 
 #: Where a run is that is in no bag.
 IN_MEMORY = Path("in memory")
+_NO_IMAGE = "there is no full-circle image"
 
 
 @dataclass
@@ -105,6 +115,13 @@ class Run:
         track : Track
             Where the sonar was.
 
+        Raises
+        ------
+        BagError
+            If the image has a stamp that the track does not cover, as `read_run` leaves such an image out.
+        InputTypeError
+            If either is something else.
+
         Examples
         --------
         >>> import csas_shadow_ros as csas
@@ -116,8 +133,13 @@ class Run:
         """
         check_type("image", image, CoherentImage, "a CoherentImage")
         check_type("track", track, Track, "a Track")
-        name = int(track.stamps_ns[0])
-        return cls(IN_MEMORY, NAMESPACE, image, track, {"image": 1}, run_ns=name, run_names=(name,))
+        book = TrackBook.of(track)
+        (name,) = book.names
+        run = cls(IN_MEMORY, NAMESPACE, image, track, {"image": 1}, run_ns=name, run_names=(name,))
+        if image.stamp_ns and not book.runs_of(image.stamp_ns):
+            run.report(Problem("image", None, image.stamp_ns, book.not_covered()))
+            raise BagError(run.why(_NO_IMAGE))
+        return run
 
     def __repr__(self) -> str:
         where = "in memory" if self.path is IN_MEMORY else f"of {self.path}"
@@ -203,7 +225,7 @@ class Run:
             return self.image
         if self.counts.get("sector"):
             return self.sector_sum().image()
-        raise BagError(self.why("there is no full-circle image"))
+        raise BagError(self.why(_NO_IMAGE))
 
     @property
     def frame(self) -> str:
@@ -446,6 +468,8 @@ def write_run(
 ) -> Path:
     """Write a run as a rosbag2 directory that any ROS 2 tool can open.
 
+    The directory is there once it is whole: if anything fails, what was there before stays as it was.
+
     Parameters
     ----------
     path : path-like
@@ -508,7 +532,7 @@ def write_run(
     def name(relative: str) -> str:
         return absolute_name(relative, namespace)
 
-    with BagWriter(path, compress=compress, overwrite=overwrite) as writer:
+    with whole_bag(path, compress=compress, overwrite=overwrite) as writer:
         for latched in ("image", "camera_info", "track"):
             if track if latched == "track" else image:
                 writer.add_topic(name(latched), TOPICS[latched].type_name, depth=1)

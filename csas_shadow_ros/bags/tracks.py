@@ -118,11 +118,7 @@ class BagRuns:
 
     def not_covered(self, what: str = "its stamp") -> str:
         """State that no track covers a stamp, and what the tracks cover."""
-        spans = [self.book.span(name) for name in self.names]
-        named = ", ".join(f"{first} to {last} ns" for first, last in spans[:4])
-        named += f" and {len(spans) - 4} more" if len(spans) > 4 else ""
-        tracks = "the track covers" if len(spans) == 1 else "the tracks cover"
-        return f"no track covers {what}: {tracks} {named}"
+        return self.book.not_covered(what)
 
     @property
     def frame(self) -> str:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ..node_table import REPLACEABLE
 from .console import FAILED, PROGRAM, Console
 from .each_run import each_run, give_report
 from .options import (
@@ -56,6 +57,13 @@ def _replay_options(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--view", action="store_true", help="open the operator's page beside the run; it stays until Ctrl-C"
     )
+    p.add_argument(
+        "--without",
+        action="append",
+        default=[],
+        metavar="NODE",
+        help=f"leave this node ({', '.join(REPLACEABLE)}) to one of your own; repeatable",
+    )
     p.add_argument("--no-browser", action="store_true", help="with --view: only print the page's address")
     run_option(p, each=True)
     objects_option(p)
@@ -92,6 +100,7 @@ def _replay(arguments: argparse.Namespace, console: Console) -> int:
                 progress=bar,
                 notice=console.notice,
                 viewer_port=port,
+                without=arguments.without,
             )
         code = give_report(console, out, report)
         if lacking := report.get("not_recorded"):

@@ -2,6 +2,15 @@
 
 from __future__ import annotations
 
+import math
+import operator
+from numbers import Complex, Real
+
+#: The latest stamp of ROS 2: int32 seconds and a second's nanoseconds.
+MAX_STAMP_NS = (1 << 31) * 1_000_000_000 - 1
+#: What an error quotes of a value.
+_MOST_QUOTED = 60
+
 
 class CsasError(Exception):
     """Root of every error that this package raises on purpose."""
@@ -61,6 +70,12 @@ class MissingExtraError(CsasError, ImportError):
     """A library of one function is not installed; the message names the extra that brings it."""
 
 
+def shown(value: object) -> str:
+    """Return a value for an error: on one line, cut short."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= _MOST_QUOTED else f"{text[:_MOST_QUOTED]}…"
+
+
 def check_type(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
     """Raise unless an argument is of a kind.
 
@@ -84,6 +99,96 @@ def check_type(name: str, value: object, kind: type | tuple[type, ...], expected
         raise InputTypeError(f"{name} is a {type(value).__name__}; expected {expected}")
 
 
+def check_number(name: str, value: object) -> float:
+    """Return a value as a float, finite or not; a text is no number, whatever it says.
+
+    Parameters
+    ----------
+    name : str
+        What the value is, for the message.
+    value : object
+        The value.
+
+    Raises
+    ------
+    ParameterError
+        If it is no real number.
+    """
+    try:
+        if isinstance(value, str | bytes | bytearray):
+            raise TypeError
+        if isinstance(value, Complex) and not isinstance(value, Real):  # numpy would drop its imaginary part
+            raise TypeError
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        raise ParameterError(f"{name} is {shown(value)}; expected a number") from None
+
+
+def check_finite(name: str, value: object, unit: str = "") -> float:
+    """Return a value as a float.
+
+    Raises
+    ------
+    ParameterError
+        If it is no finite real number.
+    """
+    number = check_number(name, value)
+    if not math.isfinite(number):
+        raise ParameterError(f"{name} is {number}{unit and f' {unit}'}; expected a finite number")
+    return number
+
+
+def check_numbers(name: str, values: object, count: int, unit: str = "") -> tuple[float, ...]:
+    """Return so many finite numbers as floats.
+
+    Raises
+    ------
+    ParameterError
+        If they are not so many, or one is no finite number.
+    """
+    try:
+        parts = [] if isinstance(values, str | bytes) else list(values)  # type: ignore[call-overload]
+    except TypeError:
+        parts = []
+    if len(parts) != count:
+        many = {2: "two", 3: "three"}.get(count, count)
+        raise ParameterError(f"{name} is {shown(values)}; expected {many} numbers")
+    return tuple(check_finite(name, part, unit) for part in parts)
+
+
+def check_whole(name: str, value: object, low: int, high: int, unit: str = "") -> int:
+    """Return a value as an int.
+
+    Raises
+    ------
+    InputTypeError
+        If it is no whole number, as 2.0 is none.
+    ParameterError
+        If it is outside [low, high].
+    """
+    try:
+        number = operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        raise InputTypeError(f"{name} is {shown(value)}; expected a whole number") from None
+    if not low <= number <= high:
+        unit = f" {unit}" if unit else ""
+        raise ParameterError(f"{name} is {shown(number)}{unit}; expected [{low}, {high}]{unit}")
+    return number
+
+
+def check_stamp(what: str, value: object) -> int:
+    """Return the stamp of something as an int; 0 where it is not known.
+
+    Raises
+    ------
+    InputTypeError
+        If it is no whole number: a double holds the time since 1970 to 256 ns alone.
+    ParameterError
+        If no message can carry it.
+    """
+    return check_whole(f"stamp (ns) of the {what}", value, 0, MAX_STAMP_NS, "ns")
+
+
 def check_range(
     name: str, value: float, low: float, high: float, unit: str = "", *, open_low: bool = False
 ) -> float:
@@ -105,10 +210,7 @@ def check_range(
     ParameterError
         If the value is not a finite number inside the bounds.
     """
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise ParameterError(f"{name} is {value!r}; expected a number") from None
+    number = check_number(name, value)
     inside = (low < number if open_low else low <= number) and number <= high
     if not inside:  # also true for NaN
         bracket = "(" if open_low else "["

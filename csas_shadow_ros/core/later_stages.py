@@ -13,6 +13,7 @@ from dataclasses import replace
 
 from .errors import ParameterError, ViewError
 from .geometry import View
+from .methods import method_named, names_that_take
 from .parameters import MAX_OBJECTS, VIEW_STAGES, PipelineParameters
 from .pipeline import ProcessedView, Result, process
 from .reconstruction import Reconstruction
@@ -110,8 +111,8 @@ def check_method(stage: str, parameters: PipelineParameters) -> None:
         Naming both.
     """
     carving = parameters.carving
-    if stage in ("likelihood", "shadow_mask") and (stage == "shadow_mask") != carving.takes_masks:
-        expected = "consensus or hard" if stage == "shadow_mask" else "soft"
+    if stage in ("likelihood", "shadow_mask") and stage != method_named(carving.method).takes:
+        expected = names_that_take(stage)
         raise ParameterError(f"method is {carving.method!r}; expected {expected} for {stage} views")
 
 

@@ -24,6 +24,7 @@ from .geometry import (
     unit_to_sonar,
     view_ground_to_pixel,
 )
+from .methods import method_named
 from .parameters import CarvingParameters, SubApertureParameters
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ def warm_carving(parameters: CarvingParameters | None = None) -> None:
     occupied[:3, 4:8, 4:8] = True
     grid = replace(grid, occupied=occupied, likelihood=np.where(occupied, 0.0, 1.0).astype(np.float32))
     measure(mesh_from_grid(grid))
-    if p.method == "consensus":
+    if method_named(p.method).looks_twice:
         carver.shadow_fits([grid])
         voxels = np.ascontiguousarray(np.argwhere(occupied), np.int32)
         count_shadow_pixels(view, grid.volume, voxels, pixels > 0, np.zeros(len(voxels), np.int32))

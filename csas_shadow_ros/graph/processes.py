@@ -24,6 +24,7 @@ from typing import IO, Any
 from msg_adapters.progress import GRAPH_ID
 
 from ..core.errors import CsasError
+from ..node_table import NODES
 from ..nodes.runtime.params import check, yaml_text
 from ..nodes.runtime.shared_memory import (
     LOCKED_S,
@@ -41,17 +42,7 @@ PACKAGE = "csas_shadow_ros"
 MAX_DOMAIN_ID = 232
 #: Of a domain's ports 0 and 1 are its multicast ones, and 10 and up its participants': this one is nobody's.
 _HELD = 9
-#: The first to be started are those that have most to do before there is a view.
-_START_ORDER = (
-    "bag_player",
-    "sub_aperture",
-    "shadow_enhancement",
-    "shadow_likelihood",
-    "voxel_carver",
-    "composites",
-    "bag_recorder",
-    "viewer",
-)
+_START_ORDER = tuple(NODES)
 #: Each process has its own numerical libraries: as many threads in each as there are cores would only wait.
 THREADS_OF_LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 #: What a node that is started again is told besides: the recording is there, and to be gone on with.

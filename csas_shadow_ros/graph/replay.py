@@ -13,11 +13,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from ..core import errors
 from ..core.errors import CsasError, NoTargetError, ParameterError
-from ..core.parameters import MAX_OBJECTS, PipelineParameters
+from ..core.parameters import MAX_OBJECTS, PipelineParameters, Stage
+from ..node_table import NODES as _NODES
+from ..node_table import REPLACEABLE, chain, joins, makers
 from ..nodes.runtime.params import NODES, check
 from .processes import (
     MAX_DOMAIN_ID,
@@ -43,23 +45,8 @@ if TYPE_CHECKING:
     from ..core.shape.result import Result
     from ..core.shape.volume import Target, VoxelGrid
 
-#: Stages of a bag, and the nodes that turn each into the next.
-_CHAIN = {
-    "image": ("sub_aperture", "shadow_enhancement", "shadow_likelihood", "voxel_carver"),
-    "sector": ("sub_aperture", "shadow_enhancement", "shadow_likelihood", "voxel_carver"),
-    "sub_aperture": ("shadow_enhancement", "shadow_likelihood", "voxel_carver"),
-    "shadow": ("shadow_likelihood", "voxel_carver"),
-    "likelihood": ("voxel_carver",),
-    "shadow_mask": ("voxel_carver",),
-}
 #: Who may have refused a view before it is in a stream.
-_STAGES_BEFORE: dict[str, tuple[str, ...]] = {
-    "sub_aperture": (),
-    "shadow": ("shadow_enhancement",),
-    "likelihood": ("shadow_enhancement", "shadow_likelihood"),
-    "shadow_mask": ("shadow_enhancement", "shadow_likelihood"),
-}
-_WITH_COMPOSITES = ("image", "sector", "sub_aperture")
+_STAGES_BEFORE = {stage: makers(stage) for stage in get_args(Stage)}
 #: How often every node is heard (`nodes.base.BEAT_S`).
 BEAT_S = 0.5
 #: What is published already comes within a second, on a busy machine in some.
@@ -398,6 +385,7 @@ def replay(
     max_restarts: int = 3,
     stall_timeout_s: float = 180.0,
     beside: Mapping[str, Mapping[str, Any]] | None = None,
+    without: Iterable[str] = (),
 ) -> ReplayResult:
     """Replay a bag through the node graph and return what it leaves.
 
@@ -438,6 +426,8 @@ def replay(
         Give up when nothing at all has changed for so long.
     beside : mapping of node name to mapping, optional
         Further nodes, with their parameters, that only look on: `viewer`.
+    without : iterable of str
+        Nodes of `REPLACEABLE` that are not started, as an outside node in this domain takes their place.
 
     Raises
     ------
@@ -455,7 +445,10 @@ def replay(
         recording = None if record is False else out / "recording" if record is True else Path(record)
         chosen, decision = _plan(bag, stage, p, namespace)
         of_stage = node_parameters(p, None if decision is None else decision.target, max_objects)
+        without = leave_out(without, chosen)
+        composites = composites and "composites" not in without
         plan = _node_plan(bag, chosen, of_stage, rate, recording, composites, window, overrides or {})
+        plan = {name: own for name, own in plan.items() if name not in without}
         plan["bag_player"]["bag_namespace"] = namespace or ""
         plan |= {name: dict(own) for name, own in (beside or {}).items()}
         check(plan)
@@ -475,6 +468,34 @@ def replay(
         if recording is not None:
             result.not_recorded = _finish_recording(recording, graph, watcher, result, set(messages))
     return result
+
+
+def leave_out(names: Iterable[str], stage: str) -> frozenset[str]:
+    """Return the nodes that a replay does not start.
+
+    Parameters
+    ----------
+    names : iterable of str
+        The nodes.
+    stage : str
+        What is played.
+
+    Raises
+    ------
+    ParameterError
+        If one is unknown, cannot be left out, or would not be started anyway.
+    """
+    left = frozenset(names)
+    for name in sorted(left):
+        if name not in _NODES:
+            raise ParameterError(f"without is {name!r}; expected one of: {', '.join(REPLACEABLE)}")
+        if why := _NODES[name].needed:
+            raise ParameterError(
+                f"a replay cannot do without {name}: {why}; expected one of: {', '.join(REPLACEABLE)}"
+            )
+        if not joins(name, stage):
+            raise ParameterError(f"without is {name!r}, but {stage} views do not pass it; expected none such")
+    return left
 
 
 @contextlib.contextmanager
@@ -540,8 +561,8 @@ def _node_plan(
     window: int,
     overrides: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, dict[str, Any]]:
-    plan: dict[str, dict[str, Any]] = {name: of_stage[name] for name in _CHAIN[stage]}
-    if composites and stage in _WITH_COMPOSITES:
+    plan: dict[str, dict[str, Any]] = {name: of_stage[name] for name in chain(stage)}
+    if composites and joins("composites", stage):
         plan["composites"] = {}
     # Figure 8 compares the methods.
     plan["voxel_carver"] |= {"compare": stage not in ("likelihood", "shadow_mask")}
@@ -754,7 +775,13 @@ def _not_recorded(
         if name not in kept:
             continue
         stages = _STAGES_BEFORE[name]
-        refused = {view.stamp_ns for view in result.rejected if view.node in stages}
+        # In the place of a node that was left out somebody else's may have refused it.
+        replaced = not result.nodes.keys() >= set(stages)
+        refused = {
+            view.stamp_ns
+            for view in result.rejected
+            if view.node in stages or (replaced and view.node not in _NODES)
+        }
         wanted = result.views_total - len(refused)
         held = min(count(f"{name}/image"), count(f"{name}/camera_info"))
         if held < wanted:

@@ -34,6 +34,7 @@ from ..core.geometry import (
 from ..core.imaging.enhancement import enhance
 from ..core.imaging.masks import MASK_COVERED, MASK_SHADOW, MASK_UNKNOWN
 from ..core.imaging.subaperture import Spectrum, SubApertures
+from ..core.methods import method_named
 from ..core.pipeline import ProcessedView
 from ..core.shape.mesh import surface_field
 from ..core.shape.picture import view_extent
@@ -510,17 +511,12 @@ def _draw_outline(axes: Any, mesh: trimesh.Trimesh) -> None:
 def figure_8(subject: Subject) -> Figure:
     """Draw the surfaces that carving leaves, by both methods, and the true target where it is known."""
     grids = [g for g in (subject.result.other_grid, subject.result.grid) if g is not None]
-    grids.sort(key=lambda g: g.method == "soft")  # the paper's order: segmented shadows first
-    titles = {
-        "hard": "space carving on segmented shadows",
-        "consensus": "consensus of segmented shadows",
-        "soft": "soft space carving",
-    }
+    grids.sort(key=lambda g: not method_named(g.method).takes_masks)  # the paper's order: masks first
     solids: list[tuple[str, trimesh.Trimesh, bool]] = []
     for grid in grids:
         mesh = _surface(grid)
         if mesh is not None:
-            solids.append((titles.get(grid.method, f"{grid.method} carving"), mesh, False))
+            solids.append((method_named(grid.method).title, mesh, False))
     if not solids:
         raise _MissingError("there is no object, so no surface")
     truth = subject.truth if subject.truth is not None and len(subject.truth.faces) else None

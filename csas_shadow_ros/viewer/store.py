@@ -23,7 +23,7 @@ from msg_adapters.camera_info import GroundInfo
 from ..core.errors import CsasError
 from ..core.geometry import Track, ViewInfo
 from ..core.shape.mesh import Dimensions
-from ..core.shape.threshold import needed_threshold
+from ..core.shape.threshold import needed_threshold, well_seen_voxels
 from ..core.shape.volume import VoxelGrid
 from . import codes
 from .codes import LOW_DB, STEP_DB, Codes
@@ -235,9 +235,7 @@ class ViewStore:
 
     def put_grid(self, name: str, grid: VoxelGrid, min_views_fraction: float = 0.25) -> None:
         """Set a volume: ``main`` (what was carved) or ``other`` (the other kind of method)."""
-        well_seen = None
-        if grid.method == "consensus":
-            well_seen = grid.views >= max(1, math.ceil(min_views_fraction * int(grid.views.max(initial=0))))
+        well_seen = well_seen_voxels(grid.views, grid.method, min_views_fraction)
         needed = needed_threshold(grid.likelihood, grid.method, well_seen)
         data = volume_codes(needed).tobytes()
         revision = f"{zlib.crc32(data):08x}"

@@ -18,7 +18,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
 from csas_shadow_ros.bags import BagReader, BagWriter, copy, read_run, write_run
-from csas_shadow_ros.core.errors import AdapterError, BagError
+from csas_shadow_ros.core.errors import AdapterError, BagError, CsasError
 from csas_shadow_ros.core.geometry import (
     Acoustics,
     CoherentImage,
@@ -586,3 +586,48 @@ def test_an_image_or_a_sector_without_a_stamp_is_not_written_and_replaces_no_bag
     sector = Sector(run.image.pixels, run.image.grid, run.image.acoustics, 0, 0.0, 1.0)
     with pytest.raises(AdapterError, match="sector has stamp 0 ns"):
         write_run(tmp_path / "new", None, run.track, sectors=[sector])
+
+
+class CallerError(Exception):
+    """Of the caller's own making."""
+
+
+def fails_after(sectors, error):
+    yield from sectors
+    raise error
+
+
+@pytest.mark.parametrize("error", [CallerError("a fault of the caller"), KeyboardInterrupt()])
+@pytest.mark.parametrize("before", ["nothing", "a bag"])
+def test_a_run_whose_writing_fails_leaves_what_was_there(tmp_path, image, track, before, error):
+    path = tmp_path / "run"
+    if before == "a bag":
+        write_run(path, image, track)
+    kept = {p.relative_to(tmp_path): p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    one = Sector(image.pixels, image.grid, image.acoustics, image.stamp_ns, 0.0, 6.28)
+    with pytest.raises(type(error)):
+        write_run(path, None, track, sectors=fails_after([one], error), overwrite=True)
+    assert {p.relative_to(tmp_path): p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == kept
+    with pytest.raises(CsasError):
+        write_run(path, image, None, extra=[("odd", object())], overwrite=True)
+    assert {p.relative_to(tmp_path): p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == kept
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run"] * bool(kept)
+
+
+def test_a_run_may_be_written_over_the_bag_that_it_is_read_from(tmp_path, image, track):
+    path = tmp_path / "run"
+    one = Sector(image.pixels, image.grid, image.acoustics, image.stamp_ns, 0.0, 6.28)
+    write_run(path, None, track, sectors=[one])
+    run = read_run(path)
+    write_run(path, None, run.track, sectors=run.sectors(), overwrite=True)
+    (again,) = read_run(path).sectors()
+    assert np.array_equal(again.pixels, one.pixels)
+
+
+def test_a_link_to_a_bag_stays_a_link(tmp_path, image, track):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "run").symlink_to(tmp_path / "disk" / "run")
+    for overwrite in (False, True):
+        write_run(tmp_path / "run", image, track, overwrite=overwrite)
+    assert (tmp_path / "run").is_symlink()
+    assert sorted(p.name for p in (tmp_path / "disk" / "run").iterdir()) == ["metadata.yaml", "run_0.mcap"]

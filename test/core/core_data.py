@@ -155,7 +155,7 @@ def make_info(
         sonar_m = (RADIUS_M * math.cos(aspect_rad), RADIUS_M * math.sin(aspect_rad), HEIGHT_M)
     a = view_ground_to_pixel(aspect_rad, spacing_m, size, size, centre)
     camera = ShadowCamera.from_ground(a, sonar_m, size, size)
-    stamp = round(math.degrees(aspect_rad) * 1e9) if stamp_ns is None else stamp_ns
+    stamp = round(math.degrees(aspect_rad) % 360.0 * 1e9) if stamp_ns is None else stamp_ns
     return ViewInfo(stamp, camera, acoustics(sign), aspect_rad, math.radians(aperture_deg))
 
 

@@ -216,7 +216,7 @@ def test_a_projection_that_is_not_north_up_orthographic_is_refused(row, col, val
         ((10, 10, 0.0, 0, 0), "pixel spacing is 0"),
         ((10, 10, -0.1, 0, 0), "pixel spacing is -0.1"),
         ((10, 10, math.nan, 0, 0), "pixel spacing is nan"),
-        ((10, 10, 0.1, math.inf, 0), "grid corner is"),
+        ((10, 10, 0.1, math.inf, 0), "grid's corner is inf"),
     ],
 )
 def test_a_grid_out_of_bounds_is_refused_by_name_and_value(arguments, match):

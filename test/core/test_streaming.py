@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from core_data import band_limited_image, circle_track
 
-from csas_shadow_ros.core.errors import GeometryError, SpectrumSignError
+from csas_shadow_ros.core.errors import CsasError, SpectrumSignError
 from csas_shadow_ros.core.geometry import Track
 from csas_shadow_ros.core.geometry.arcs import Arc, Arcs
 from csas_shadow_ros.core.parameters import (
@@ -232,8 +232,7 @@ def test_a_wrong_spectrum_sign_is_refused_when_the_circle_is_closed(simulated, s
     ("change", "message"),
     [
         ({"aperture_rad": 0.0}, "expected an arc of more than 0°"),
-        ({"aspect_rad": math.nan}, "expected an arc"),
-        ({"pixels": None}, r"1 pixels that are not finite, first pixel \(row 3, col 4\)"),
+        ({"pixels": None}, r"1 of \d+ pixels not finite, the first at row 3, column 4"),
     ],
 )
 def test_a_sector_that_cannot_be_used_is_named_and_the_sum_goes_on(sectors, change, message):
@@ -243,7 +242,7 @@ def test_a_sector_that_cannot_be_used_is_named_and_the_sum_goes_on(sectors, chan
         pixels = sectors[2].pixels.copy()
         pixels[3, 4] = np.nan
         change = {"pixels": pixels}
-    with pytest.raises(GeometryError, match=message):
+    with pytest.raises(CsasError, match=message):
         total.add(replace(sectors[2], **change))
     np.testing.assert_array_equal(total.spectrum.values, before)
     total.add(sectors[2])

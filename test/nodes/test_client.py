@@ -24,10 +24,11 @@ from graph_of_nodes import VOXEL_M
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
-from csas_shadow_ros import client
+from csas_shadow_ros import client, parameters
 from csas_shadow_ros.client import ViewSubscriber
 from csas_shadow_ros.core.errors import ParameterError
 from csas_shadow_ros.graph.processes import DomainReservation, Graph, graph_environment, start_fork_server
+from csas_shadow_ros.graph.replay import replay
 from csas_shadow_ros.nodes import qos
 from csas_shadow_ros.nodes.runtime.shared_memory import owned_files
 from msg_adapters import Heartbeat, RclpyMessages, measurements_from_msg, progress_from_msg
@@ -121,6 +122,13 @@ class Outside:
     def stamps(self) -> list[str]:
         return [s for s in re.findall(r"^([\d.]{10,}) ", self.log.read_text(), re.MULTILINE)]
 
+    def over(self) -> list[str]:
+        """Names of the runs that it says are over, each after the last view."""
+        lines = self.log.read_text().splitlines()
+        told = [n for n, line in enumerate(lines) if line.startswith("the run of ")]
+        assert all(n >= VIEWS for n in told)
+        return [lines[n].split()[3] for n in told]
+
     def got(self, views: int) -> Callable[[], bool]:
         return lambda: len(set(self.stamps())) >= views
 
@@ -189,6 +197,8 @@ def test_the_graph_completes_where_there_is_no_classifier_and_one_that_comes_aft
     for one in late:
         graph.until(one.got(VIEWS), "a late classifier has every view")
         assert len(one.stamps()) == VIEWS, "each once"
+    graph.until(lambda: graph.carved() == VIEWS and bool(late[0].over()), "it learns that the run is over")
+    assert late[0].over() == [str(graph.measurements.run_ns)]
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.5])
@@ -304,6 +314,49 @@ def test_the_results_of_an_outside_stage_are_carved_and_the_graph_completes_thou
     alone = {int(stamp) for stamp in {*second.stamps()} - {*first.stamps()}}
     graph.until(lambda: alone <= {*graph.told("network")}, "every view of the second is reported")
     assert set(graph.told("network").values()) == {"published"}
+
+
+@pytest.mark.long
+def test_a_replay_without_a_stage_carves_what_ones_own_makes_in_its_place(
+    run_bag: Path, tmp_path: Path
+) -> None:
+    code = """
+        import numpy as np, rclpy
+        from csas_shadow_ros.client import ViewSubscriber, create_node, spin
+        from csas_shadow_ros.core.imaging.segmentation import segment_shadow
+        from csas_shadow_ros.core.parameters import LikelihoodParameters
+        from csas_shadow_ros.core.imaging.likelihood import outside_likelihood, view_levels
+        from csas_shadow_ros.core.geometry import View
+
+        def look(pixels, info):
+            view, p = View(info, pixels), LikelihoodParameters()
+            return outside_likelihood(view, p, view_levels(view, p)).pixels
+
+        rclpy.init()
+        node = create_node("own", namespace="csas")
+        with ViewSubscriber(node, "shadow", look, results="likelihood", on_finished=lambda run: print(run)):
+            spin(node)
+    """
+    with DomainReservation() as domain:
+        environment = graph_environment(domain, tmp_path)
+    environment.pop("CSAS_PARENT_PID", None)
+    own = subprocess.Popen([sys.executable, program(tmp_path, code)], env=environment)
+    try:
+        made = replay(
+            run_bag,
+            tmp_path / "out",
+            parameters(step_deg=15, voxel_size_m=VOXEL_M, method="soft"),
+            domain_id=int(environment["ROS_DOMAIN_ID"]),
+            without=["shadow_likelihood"],
+            record=True,
+            progress=False,
+        )
+    finally:
+        own.send_signal(signal.SIGINT)
+        own.wait(20.0)
+    assert "shadow_likelihood" not in made.nodes
+    assert (made.views_used, made.lost, made.not_recorded) == (24, 0, [])
+    assert made.dimensions is not None
 
 
 def test_views_that_an_outside_stage_refuses_or_fails_at_are_named_and_nobody_waits_for_them(

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import GeometryError, check_range
+from ..errors import GeometryError, check_whole, shown
 from .frames import FloatArray, cross_range_axis, down_range_axis
 
 
@@ -60,11 +60,17 @@ class ShadowCamera:
     cols: int
 
     def __post_init__(self) -> None:
-        p = np.array(self.projection, dtype=np.float64).reshape(3, 4)
+        given = np.asarray(self.projection)
+        if given.size != 12 or given.dtype.kind not in "fiu":
+            raise GeometryError(
+                f"P is {shown(self.projection)} of shape {given.shape}; expected numbers of shape (3, 4)"
+            )
+        p = np.array(given, dtype=np.float64).reshape(3, 4)
         if not np.all(np.isfinite(p)):
             raise GeometryError(f"P is {p.tolist()}; expected finite numbers")
-        for name, n in (("rows", self.rows), ("cols", self.cols)):
-            check_range(f"number of {name}", n, 2, 1 << 16, "pixels")
+        for name in ("rows", "cols"):
+            n = check_whole(f"number of {name}", getattr(self, name), 2, 1 << 16, "pixels")
+            object.__setattr__(self, name, n)
         left = p[:, :3]
         scale = float(np.abs(left).max())
         if scale == 0.0 or abs(_determinant((left / scale).tolist())) < 1e-15:

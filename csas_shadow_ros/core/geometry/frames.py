@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import GeometryError, ParameterError, check_range
+from ..errors import GeometryError, ParameterError, check_finite, check_range, check_whole, shown
 
 FloatArray = NDArray[np.float64]
 
@@ -93,8 +93,8 @@ class Acoustics:
         check_range("bandwidth", self.bandwidth_hz, 0, 2 * f_c, "Hz", open_low=True)
         # The upper bound is the speed of light: the same formulas serve radar test data.
         check_range("sound speed", self.sound_speed_mps, 0, 3e8, "m/s", open_low=True)
-        if self.spectrum_sign not in (1, -1):
-            raise ParameterError(f"spectrum_sign is {self.spectrum_sign}; expected +1 or -1")
+        if isinstance(self.spectrum_sign, str) or self.spectrum_sign not in (1, -1):
+            raise ParameterError(f"spectrum_sign is {shown(self.spectrum_sign)}; expected +1 or -1")
         object.__setattr__(self, "spectrum_sign", int(self.spectrum_sign))
 
     def ground_wavenumber(self, frequency_hz: float, grazing_rad: float) -> float:
@@ -130,11 +130,12 @@ class GroundGrid:
     y_max_m: float
 
     def __post_init__(self) -> None:
-        for name, n in (("rows", self.rows), ("cols", self.cols)):
-            check_range(f"number of {name}", n, 2, 1 << 16, "pixels")
+        for name in ("rows", "cols"):
+            n = check_whole(f"number of {name}", getattr(self, name), 2, 1 << 16, "pixels")
+            object.__setattr__(self, name, n)
         check_range("pixel spacing", self.spacing_m, 0, 1e6, "m", open_low=True)
-        if not (math.isfinite(self.x_min_m) and math.isfinite(self.y_max_m)):
-            raise GeometryError(f"grid corner is ({self.x_min_m}, {self.y_max_m}) m; expected finite numbers")
+        for axis, corner in (("x", self.x_min_m), ("y", self.y_max_m)):
+            check_finite(f"{axis} of the grid's corner", corner, "m")
 
     @classmethod
     def centred(

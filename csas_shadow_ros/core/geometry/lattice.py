@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import GeometryError, check_range
+from ..errors import GeometryError, check_numbers, check_whole
 from .frames import FloatArray, GroundGrid
 
 #: A lattice whose two steps are nearer to one line than this (sine of the angle) is no map: its pixel
@@ -42,11 +42,11 @@ class GroundLattice:
     row_step_m: tuple[float, float]
 
     def __post_init__(self) -> None:
-        for name, n in (("rows", self.rows), ("cols", self.cols)):
-            check_range(f"number of {name}", n, 2, 1 << 16, "pixels")
-        numbers = (*self.origin_m, *self.column_step_m, *self.row_step_m)
-        if not all(map(math.isfinite, numbers)):
-            raise GeometryError(f"lattice is {numbers}; expected finite numbers")
+        for name in ("rows", "cols"):
+            n = check_whole(f"number of {name}", getattr(self, name), 2, 1 << 16, "pixels")
+            object.__setattr__(self, name, n)
+        for name in ("origin", "column step", "row step"):
+            check_numbers(f"{name} of the lattice", getattr(self, f"{name.replace(' ', '_')}_m"), 2, "m")
         (ax, ay), (bx, by) = self.column_step_m, self.row_step_m
         area = ax * by - ay * bx
         if abs(area) <= _LEAST_SINE * math.hypot(ax, ay) * math.hypot(bx, by):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import ParameterError
+from ..errors import ParameterError, check_number, check_numbers
 from .frames import FloatArray
 
 if TYPE_CHECKING:
@@ -102,16 +102,17 @@ class Datum:
 
     def __post_init__(self) -> None:
         for name, limit in (("latitude", 90.0), ("longitude", 360.0), ("heading", 360.0)):
-            value = getattr(self, f"{name}_deg")
+            value = check_number(f"{name} of the origin", getattr(self, f"{name}_deg"))
             if not abs(value) <= limit:  # also NaN
                 raise ParameterError(
                     f"{name} of the origin is {value:g}°; expected a number in [{-limit:g}, {limit:g}]°"
                 )
-        if not abs(self.altitude_m) <= 1e5:
+        if not abs(check_number("altitude of the origin", self.altitude_m)) <= 1e5:
             raise ParameterError(f"altitude of the origin is {self.altitude_m:g} m; expected at most 100 km")
-        if (c := self.covariance_m2) is not None and not (
-            all(map(math.isfinite, c)) and min(c[:2]) >= 0.0 and c[2] ** 2 <= c[0] * c[1] * (1 + 1e-9)
-        ):
+        if self.covariance_m2 is None:
+            return
+        c = check_numbers("covariance of the origin", self.covariance_m2, 3, "m²")
+        if not (min(c[:2]) >= 0.0 and c[2] ** 2 <= c[0] * c[1] * (1 + 1e-9)):
             raise ParameterError(
                 f"covariance of the origin is {list(c)} m²; expected finite variances >= 0 and a covariance"
                 " that fits them"

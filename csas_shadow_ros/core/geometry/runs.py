@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import GeometryError, TrackError, check_range
-from ..frame_name import SCENE_FRAME
+from ..frame_name import SCENE_FRAME, check_frame
 from .frames import FloatArray, one_frame, wrap_angle
+from .pixels import positions_of, stamps_of
 from .track import Track
 
 IntArray = NDArray[np.int64]
@@ -54,8 +55,9 @@ class TrackPiece:
     frame: str = field(default=SCENE_FRAME, kw_only=True)
 
     def __post_init__(self) -> None:
-        stamps = np.asarray(self.stamps_ns, dtype=np.int64)
-        positions = np.asarray(self.positions_m, dtype=np.float64)
+        check_frame("piece of a track", self.frame)
+        stamps = stamps_of("piece of a track", self.stamps_ns)
+        positions = positions_of("piece of a track", self.positions_m)
         if stamps.ndim != 1 or not len(stamps) or positions.shape != (len(stamps), 3):
             raise TrackError(
                 f"piece of a track has stamps {stamps.shape} and positions {positions.shape}; expected (n,),"
@@ -186,6 +188,13 @@ class TrackBook:
         #: What runs were called before an earlier pose of theirs came, and are called now.
         self.renamed: dict[int, int] = {}
 
+    @classmethod
+    def of(cls, track: Track) -> TrackBook:
+        """Make the book of a lone track."""
+        book = cls(max_poses=max(len(track), 3))
+        book.add(TrackPiece(track.stamps_ns, track.positions_m, frame=track.frame))
+        return book
+
     @property
     def names(self) -> tuple[int, ...]:
         """Names of the known runs (stamps of their first poses, ns), in time."""
@@ -254,6 +263,14 @@ class TrackBook:
         """Return the stamps of a run's first and last pose."""
         run = self._run(run_ns)
         return run.first, run.last
+
+    def not_covered(self, what: str = "its stamp") -> str:
+        """State that no track covers a stamp, and what the tracks cover."""
+        spans = [self.span(name) for name in self.names]
+        named = ", ".join(f"{first} to {last} ns" for first, last in spans[:4])
+        named += f" and {len(spans) - 4} more" if len(spans) > 4 else ""
+        tracks = "the track covers" if len(spans) == 1 else "the tracks cover"
+        return f"no track covers {what}: {tracks} {named}"
 
     def track(self, run_ns: int) -> Track:
         """Return all poses of a run; the same object until another piece arrives.

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import TrackError, check_range
-from ..frame_name import SCENE_FRAME
+from ..frame_name import SCENE_FRAME, check_frame
 from .frames import TWO_PI, FloatArray, wrap_angle
+from .pixels import indices_of, positions_of, stamps_of
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,8 @@ class Track:
     TrackError
         If there are fewer than three poses, stamps do not increase, a number is not finite, the
         sonar is not above the seabed, or passes over the scene's origin.
+    InputTypeError
+        If a stamp is no whole number, a position no number, or the frame no name.
     """
 
     def __init__(
@@ -92,8 +95,8 @@ class Track:
         doubtful: Sequence[DoubtfulArc] = (),
         frame: str = SCENE_FRAME,
     ) -> None:
-        stamps = np.asarray(stamps_ns, dtype=np.int64)
-        positions = np.array(positions_m, dtype=np.float64)
+        check_frame("track", frame)
+        stamps, positions = stamps_of("track", stamps_ns), positions_of("track", positions_m)
         if positions.ndim != 2 or positions.shape[1] != 3 or stamps.shape != positions.shape[:1]:
             raise TrackError(
                 f"track has stamps {stamps.shape} and positions {positions.shape}; expected (n,), (n, 3)"
@@ -124,7 +127,7 @@ class Track:
         self.max_gap_rad = check_range("max_gap_rad", max_gap_rad, 0, math.pi, "rad", open_low=True)
         #: Aspect of each pose, unwrapped along the track (rad).
         self.aspects_rad = np.unwrap(np.arctan2(positions[:, 1], positions[:, 0]))
-        self.breaks = np.array(breaks, dtype=np.int64).reshape(-1)
+        self.breaks = indices_of("breaks of the track", breaks)
         if self.breaks.size and not 0 <= self.breaks.min() <= self.breaks.max() < len(stamps) - 1:
             raise TrackError(
                 f"track breaks are {self.breaks.tolist()}; expected poses 0 to {len(stamps) - 2}"

@@ -10,10 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import GeometryError
-from ..frame_name import SCENE_FRAME
+from ..errors import (
+    GeometryError,
+    check_finite,
+    check_number,
+    check_numbers,
+    check_range,
+    check_stamp,
+    check_type,
+)
+from ..frame_name import SCENE_FRAME, check_frame
 from .camera import ShadowCamera
 from .frames import TWO_PI, Acoustics, FloatArray, GroundGrid, down_range_axis
+from .pixels import COHERENT, OF_A_VIEW, check_finite_pixels, check_pixels
 
 
 @dataclass(frozen=True)
@@ -48,6 +57,16 @@ class ViewInfo:
     carrier_rad_m: tuple[float, float] = (0.0, 0.0)
     focus_range_m: float = math.nan
     frame: str = field(default=SCENE_FRAME, kw_only=True)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "stamp_ns", check_stamp("view", self.stamp_ns))
+        check_type("camera of the view", self.camera, ShadowCamera, "a ShadowCamera")
+        check_type("acoustics of the view", self.acoustics, Acoustics, "an Acoustics")
+        check_finite("aspect of the view", self.aspect_rad, "rad")
+        check_range("aperture of the view", self.aperture_rad, 0.0, TWO_PI * (1.0 + 1e-9), "rad")
+        check_numbers("carrier of the view", self.carrier_rad_m, 2, "rad/m")
+        check_number("focus range of the view", self.focus_range_m)
+        check_frame("view", self.frame)
 
     @property
     def resolution_m(self) -> tuple[float, float]:
@@ -91,10 +110,8 @@ class View:
     pixels: NDArray[Any]
 
     def __post_init__(self) -> None:
-        if self.pixels.shape != self.info.camera.shape:
-            raise GeometryError(
-                f"view has {self.pixels.shape} pixels; its camera says {self.info.camera.shape} (rows, cols)"
-            )
+        check_type("info of the view", self.info, ViewInfo, "a ViewInfo")
+        check_pixels("view", self.pixels, self.info.camera.shape, "camera", OF_A_VIEW)
 
     def __repr__(self) -> str:
         (rows, cols), (down_m, cross_m) = self.pixels.shape, self.info.camera.spacing_m
@@ -121,6 +138,12 @@ class CoherentImage:
         Stamp of the message that it came in.
     frame : str
         Name of the scene frame that it is in: one for all of a run.
+
+    Raises
+    ------
+    CsasError
+        If the pixels are not complex, not finite or not of the grid's shape, the stamp is no whole number,
+        or something else is no what it should be; also a ValueError or a TypeError.
     """
 
     pixels: NDArray[Any]
@@ -130,10 +153,12 @@ class CoherentImage:
     frame: str = field(default=SCENE_FRAME, kw_only=True)
 
     def __post_init__(self) -> None:
-        if self.pixels.shape != self.grid.shape:
-            raise GeometryError(
-                f"image has {self.pixels.shape} pixels; its grid says {self.grid.shape} (rows, cols)"
-            )
+        check_type("grid of the image", self.grid, GroundGrid, "a GroundGrid")
+        check_type("acoustics of the image", self.acoustics, Acoustics, "an Acoustics")
+        object.__setattr__(self, "stamp_ns", check_stamp("image", self.stamp_ns))
+        check_frame("image", self.frame)
+        check_pixels("image", self.pixels, self.grid.shape, "grid", COHERENT)
+        check_finite_pixels("image", self.pixels)
 
     def __repr__(self) -> str:
         (rows, cols), band = self.pixels.shape, self.acoustics

@@ -22,7 +22,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ..errors import ParameterError, TrackError, ViewError
+from ..errors import ParameterError, TrackError, ViewError, check_type
 from ..geometry import (
     CoherentImage,
     GroundGrid,
@@ -34,6 +34,7 @@ from ..geometry import (
     one_frame,
     view_ground_to_pixel,
 )
+from ..geometry.pixels import check_finite_pixels
 from ..kernels import kernel
 from ..parameters import SubApertureParameters
 from .interpolation import interpolate_four, interpolate_one
@@ -87,12 +88,8 @@ class Spectrum:
         values = scipy.fft.fft2(pixels, s=shape, norm="forward", workers=workers)
         # One pixel that is not finite spoils every bin: the zeroth one tells.
         if not np.isfinite(values[0, 0]):
-            bad = np.argwhere(~np.isfinite(pixels))
-            where = f"pixel (row {bad[0, 0]}, col {bad[0, 1]})" if len(bad) else "the sum of its pixels"
-            raise ParameterError(
-                f"the image holds {len(bad)} pixels that are not finite, first {where};"
-                " expected finite numbers"
-            )
+            check_finite_pixels("image", pixels)
+            raise ParameterError(f"the image's pixels sum to {values[0, 0]}; expected smaller numbers")
         return cls(values, image.grid)
 
     @property
@@ -383,7 +380,10 @@ class SubApertures:
         workers: int = 2,
         spectrum: Spectrum | None = None,
     ) -> None:
-        p = parameters or SubApertureParameters()
+        check_type("image", image, CoherentImage, "a CoherentImage")
+        check_type("track", track, Track, "a Track")
+        p = SubApertureParameters() if parameters is None else parameters
+        check_type("parameters", p, SubApertureParameters, "a SubApertureParameters")
         one_frame("the track", track.frame, image.frame, "the image")
         self.parameters = p
         self.track = track

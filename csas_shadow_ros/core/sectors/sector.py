@@ -10,8 +10,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import GeometryError
-from ..geometry import SCENE_FRAME, Acoustics, CoherentImage, GroundGrid, GroundLattice, unit_to_sonar
+from ..errors import GeometryError, check_finite, check_numbers, check_stamp, check_type
+from ..frame_name import SCENE_FRAME, check_frame
+from ..geometry import Acoustics, CoherentImage, GroundGrid, GroundLattice, unit_to_sonar
+from ..geometry.pixels import COHERENT, check_pixels
 
 #: A wavenumber under this fraction of the band's lower edge would need a grazing angle over 66°.
 LEAST_COSINE = 0.4
@@ -35,18 +37,23 @@ class HasBand(Protocol):
     @property
     def grid(self) -> GroundGrid | GroundLattice:
         """Lattice."""
+
     @property
     def acoustics(self) -> Acoustics:
         """Band."""
+
     @property
     def frame(self) -> str:
         """Frame id."""
+
     @property
     def aspect_rad(self) -> float:
         """Middle of its arc."""
+
     @property
     def aperture_rad(self) -> float:
         """Width of its arc."""
+
     @property
     def carrier_rad_m(self) -> tuple[float, float]:
         """Wavenumber that its pixels are at."""
@@ -84,10 +91,16 @@ class Sector:
     frame: str = field(default=SCENE_FRAME, kw_only=True)
 
     def __post_init__(self) -> None:
-        if self.pixels.shape != self.grid.shape:
-            raise GeometryError(
-                f"sector has {self.pixels.shape} pixels; its grid says {self.grid.shape} (rows, cols)"
-            )
+        expected = "a GroundGrid or a GroundLattice"
+        check_type("grid of the sector", self.grid, (GroundGrid, GroundLattice), expected)
+        check_type("acoustics of the sector", self.acoustics, Acoustics, "an Acoustics")
+        object.__setattr__(self, "stamp_ns", check_stamp("sector", self.stamp_ns))
+        check_finite("aspect of the sector", self.aspect_rad, "rad")
+        check_finite("arc of the sector", self.aperture_rad, "rad")
+        check_numbers("carrier of the sector", self.carrier_rad_m, 2, "rad/m")
+        check_frame("sector", self.frame)
+        # That they are finite is seen where they are read, and where they are summed: a sector comes often.
+        check_pixels("sector", self.pixels, self.grid.shape, "grid", COHERENT)
 
     def carrier(self) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
         """Return exp(j carrier · (x, y)) as a factor of the columns and one of the rows."""

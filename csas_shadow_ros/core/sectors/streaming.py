@@ -18,10 +18,11 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ..errors import GeometryError, NoTargetError, ViewError
+from ..errors import GeometryError, NoTargetError, ParameterError, ViewError
 from ..geometry import TWO_PI, CoherentImage, GroundGrid, Track
 from ..geometry.arcs import TOLERANCE_RAD, Arc, Arcs
 from ..geometry.passage import passage
+from ..geometry.pixels import check_finite_pixels
 from ..imaging.subaperture import Spectrum, SubApertures
 from ..kernels import kernel
 from ..parameters import MAX_OBJECTS, PipelineParameters, SubApertureParameters, TargetParameters
@@ -204,7 +205,9 @@ class SectorSum:
         ------
         GeometryError
             If its band is not the first one's, its lattice folds its arc or covers less than the scene, its
-            arc is no arc, or a pixel is not finite.
+            arc is no arc.
+        ParameterError
+            If a pixel is not finite.
         """
         if sector.stamp_ns in self.stamps:
             return None
@@ -213,12 +216,8 @@ class SectorSum:
         empty = np.empty((0, 0), np.complex64)
         energy = _arc_of_box(pixels, (0, 0), (1.0, 1.0), 0.0, 0.0, True, empty) / pixels.size
         if not math.isfinite(energy):
-            bad = np.argwhere(~np.isfinite(sector.pixels))
-            where = f", first pixel (row {bad[0, 0]}, col {bad[0, 1]})" if len(bad) else ""
-            raise GeometryError(
-                f"sector at {sector.stamp_ns} ns holds {len(bad)} pixels that are not finite{where};"
-                " expected finite numbers"
-            )
+            check_finite_pixels(f"sector at {sector.stamp_ns} ns", sector.pixels)
+            raise ParameterError(f"energy of the sector at {sector.stamp_ns} ns is {energy}; expected less")
         if self._spectrum is None:
             shape = tuple(scipy.fft.next_fast_len(n) for n in scene.shape)
             blank = np.broadcast_to(np.complex64(0), scene.shape)
@@ -234,7 +233,7 @@ class SectorSum:
     def _check(self, sector: Sector, grazing_rad: float | None) -> GroundGrid:
         """Refuse a sector that cannot be of this sum; return the scene's lattice."""
         name = f"sector at {sector.stamp_ns} ns"
-        if not 0.0 < sector.aperture_rad <= TWO_PI * (1.0 + 1e-9) or not math.isfinite(sector.aspect_rad):
+        if not 0.0 < sector.aperture_rad <= TWO_PI * (1.0 + 1e-9):
             raise GeometryError(
                 f"{name} has aspect {math.degrees(sector.aspect_rad):g}° and aperture"
                 f" {math.degrees(sector.aperture_rad):g}°; expected an arc of more than 0° and at most 360°"

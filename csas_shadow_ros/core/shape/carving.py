@@ -28,6 +28,7 @@ from ..errors import ParameterError, ViewError
 from ..geometry import View, ViewInfo
 from ..imaging.masks import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, KeptMask
 from ..kernels import kernel
+from ..methods import method_named
 from ..parameters import CarvingParameters
 from ..threads import in_order
 from .explained import ShadowFit, count_shadow_pixels, shadow_fit, unexplained_shadow
@@ -438,7 +439,7 @@ class Carver:
         else:
             self._sums.add_image(np.ascontiguousarray(view.pixels), view.info)
         self.stamps.add(view.info.stamp_ns)
-        if self.parameters.method == "consensus":
+        if method_named(self.parameters.method).looks_twice:
             self._masks[view.info.stamp_ns] = KeptMask.of(view)
         return True
 
@@ -447,7 +448,7 @@ class Carver:
         method = self.parameters.method
         if not self.parameters.takes_masks:
             if pixels.dtype != np.float32:
-                raise ViewError(f"soft carving got {pixels.dtype} pixels; expected float32 l_out")
+                raise ViewError(f"{method} carving got {pixels.dtype} pixels; expected float32 l_out")
             low, high = float(np.nanmin(pixels, initial=1.0)), float(np.nanmax(pixels, initial=0.0))
             if low < 0.0 or high > 1.0:
                 raise ViewError(f"l_out of the view spans [{low:g}, {high:g}]; expected [0, 1] or NaN")
@@ -486,7 +487,7 @@ class Carver:
             With NaN threshold and nothing occupied where there is no object.
         """
         carver, first = self, self.first_look()
-        if self.parameters.method != "consensus" or not first.occupied.any():
+        if not method_named(self.parameters.method).looks_twice or not first.occupied.any():
             return first
         slope = self._slope(first)
         if slope is not None and slope.believed:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry import SCENE_FRAME
+from ..methods import method_named
 from .mesh import Dimensions
 from .volume import Target, VoxelGrid
 
@@ -230,7 +231,7 @@ class Result:
     def by_likelihood_alone(self) -> bool:
         """Whether only the mean likelihood of all views shows the object, not silhouettes."""
         grid, other = self.grid, self.other_grid
-        if grid is None or other is None or grid.method != "soft":
+        if grid is None or other is None or method_named(grid.method).takes_masks:
             return False
         return bool(grid.occupied.any()) and not other.occupied.any()
 

@@ -8,6 +8,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from ..errors import MissingExtraError
+from ..methods import method_named
 from .verdict import no_object_reason
 
 if TYPE_CHECKING:
@@ -111,9 +112,6 @@ def to_xarray(result: Result) -> xarray.Dataset:
         return xarray.Dataset(attrs=attributes)
     volume, dims = grid.volume, ("z", "y", "x")
     matter = grid.occupied if result.matter is None else result.matter
-    says = "fraction of views that contradict"
-    if grid.method == "soft":
-        says = "mean likelihood of lying outside the shadow"
     attributes |= {
         "method": grid.method,
         "threshold": grid.threshold,
@@ -122,7 +120,7 @@ def to_xarray(result: Result) -> xarray.Dataset:
     }
     return xarray.Dataset(
         {
-            "likelihood": (dims, grid.likelihood, {"long_name": says}),
+            "likelihood": (dims, grid.likelihood, {"long_name": method_named(grid.method).says}),
             "views": (dims, grid.views, {"long_name": "views that know something"}),
             "occupied": (dims, grid.occupied, {"long_name": "object's voxels"}),
             "matter": (dims, matter, {"long_name": "object's voxels without its hollows"}),

@@ -8,23 +8,10 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
+from ..methods import method_named
 from ..parameters import CarvingParameters
 from .volume import Volume, VoxelGrid
 
-#: Soft: where the threshold lies between the darkest voxels (0) and the brightest (1) of the volume. A
-#: voxel just outside the object is bright in some views only: those that look past the object's side.
-_SOFT_LEVEL = 0.115
-#: Consensus: a voxel is removed when more than this fraction of its views contradict it. A voxel 2 cm off
-#: the middle of a flat side of 0.8 m is seen to be free from 3 % of the circle; less tolerance loses voxels
-#: to bad silhouettes, more leaves a skirt round flat sides.
-_CONSENSUS = 0.03
-#: Consensus: a voxel that a smaller fraction of the views knows is unknown.
-_LEAST_VIEWS = 0.04
-#: Hard: any contradiction removes; the least one, 1 of 65535 views, is above this.
-_HARD = 1e-5
-#: Soft: a voxel under the object is part of it unless its likelihood is over this. Masks say "unknown"
-#: where the target's echo lies, so that for them only unknown voxels need filling.
-_SOFT_SUPPORT = 0.35
 #: No object: the darkest voxels are brighter than this fraction of the brightest.
 _NO_OBJECT = 0.5
 #: How many voxels "the darkest" are.
@@ -42,34 +29,33 @@ def object_threshold(likelihood: NDArray[np.float32], method: str) -> float:
     ----------
     likelihood : ndarray of float32
         Mean l_out, or the fraction of views that contradict the voxel; NaN unknown.
-    method : {'consensus', 'hard', 'soft'}
-        How it was carved.
+    method : str
+        How it was carved: a name of `METHODS`.
 
     Returns
     -------
     float
         Threshold; NaN where no voxel is much darker than the rest, and the rest is free: there is no object.
     """
+    how = method_named(method)
     known = likelihood[np.isfinite(likelihood)]
     if known.size < 2 * _DARKEST:
         return math.nan
     dark = float(np.partition(known, _DARKEST)[:_DARKEST].mean())
     bright = float(np.percentile(known, 99.0))
-    inside = {"consensus": _CONSENSUS, "hard": _HARD}.get(method, _SOFT_SUPPORT)
+    inside = how.support if how.under is None else how.under
     if bright < inside:
         return inside  # nothing of the volume is seen to be free: it lies within the object
     if dark > _NO_OBJECT * bright:
         return math.nan
-    if method == "soft":
-        return dark + _SOFT_LEVEL * (bright - dark)
-    return _CONSENSUS if method == "consensus" else _HARD
+    return dark + how.level * (bright - dark) if how.under is None else how.under
 
 
 def least_threshold(parameters: CarvingParameters) -> float | None:
     """Return the threshold if it is independent of the voxels, otherwise None."""
     if parameters.threshold:
         return parameters.threshold
-    return {"consensus": _CONSENSUS, "hard": _HARD}.get(parameters.method)
+    return method_named(parameters.method).under
 
 
 def supported(dark: NDArray[np.bool_], likelihood: NDArray[np.float32], limit: float) -> NDArray[np.bool_]:
@@ -102,9 +88,7 @@ def least_views_fraction(parameters: CarvingParameters) -> float:
     By silhouettes, a few views can tell that a voxel is *not* object. What they cannot do alone is to
     say that it is: see `occupied_voxels`.
     """
-    if parameters.method == "consensus":
-        return min(parameters.min_views_fraction, _LEAST_VIEWS)
-    return parameters.min_views_fraction
+    return min(parameters.min_views_fraction, method_named(parameters.method).least_views)
 
 
 def occupied_voxels(
@@ -123,17 +107,18 @@ def occupied_voxels(
         NaN unknown: never object by itself.
     threshold : float
         NaN for no object.
-    method : {'consensus', 'hard', 'soft'}
+    method : str
         How it was carved.
     well_seen : ndarray of bool, shape (nz, ny, nx), optional
         Voxels that enough views know. One that fewer know, as its shadow leaves the image in most views, is
         object only where it stands on the object: high tops stay, phantom roofs do not.
     """
+    how = method_named(method)
     if math.isnan(threshold):
         return np.zeros(likelihood.shape, bool)
     with np.errstate(invalid="ignore"):
         dark = likelihood < threshold
-    limit = max(_SOFT_SUPPORT, threshold) if method == "soft" else threshold
+    limit = max(how.support, threshold)
     if well_seen is None:
         body = supported(dark, likelihood, limit)
     else:
@@ -147,6 +132,18 @@ def occupied_voxels(
     if sizes.max() < LEAST_VOXELS:
         return np.zeros(likelihood.shape, bool)
     return np.asarray((sizes >= _PIECE * sizes.max())[labels] & body)
+
+
+def well_seen_voxels(
+    views: NDArray[np.uint16], method: str, min_views_fraction: float
+) -> NDArray[np.bool_] | None:
+    """Return the voxels that enough views know to be object by themselves.
+
+    None if a voxel that fewer know is unknown anyway, as it is unless few views may say that it is free.
+    """
+    if method_named(method).least_views >= 1.0:
+        return None
+    return views >= max(1, math.ceil(min_views_fraction * int(views.max(initial=0))))
 
 
 def thresholded(
@@ -170,9 +167,7 @@ def thresholded(
     """
     method = parameters.method
     threshold = parameters.threshold or object_threshold(likelihood, method)
-    well_seen = None
-    if method == "consensus":
-        well_seen = views >= max(1, math.ceil(parameters.min_views_fraction * int(views.max(initial=0))))
+    well_seen = well_seen_voxels(views, method, parameters.min_views_fraction)
     occupied = occupied_voxels(likelihood, threshold, method, well_seen)
     return VoxelGrid(volume, likelihood, views, threshold, occupied, method)
 
@@ -198,7 +193,7 @@ def needed_threshold(
     never = np.float32(np.inf)
     trusted = likelihood if well_seen is None else np.where(well_seen, likelihood, np.float32(np.nan))
     out = np.where(np.isnan(trusted), never, trusted)
-    support = np.float32(_SOFT_SUPPORT if method == "soft" else 0.0)
+    support = np.float32(method_named(method).support)
     for k in range(out.shape[0] - 2, -1, -1):
         with np.errstate(invalid="ignore"):
             open_to = np.isnan(trusted[k]) | (trusted[k] < support)

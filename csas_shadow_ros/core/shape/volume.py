@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import GeometryError, check_range
+from ..errors import GeometryError, InputTypeError, check_numbers, check_range, check_type, check_whole, shown
+from ..methods import method_named
 
 if TYPE_CHECKING:
     from .seabed import SeabedSlope
@@ -69,10 +70,11 @@ class Volume:
 
     def __post_init__(self) -> None:
         check_range("voxel size", self.voxel_size_m, 0, 1e4, "m", open_low=True)
-        if not np.all(np.isfinite(self.origin_m)):
-            raise GeometryError(f"volume origin is {self.origin_m}; expected finite metres")
+        check_numbers("origin of the volume", self.origin_m, 3, "m")
+        if not isinstance(self.shape, tuple) or len(self.shape) != 3:
+            raise InputTypeError(f"shape of the volume is {shown(self.shape)}; expected three whole numbers")
         for axis, n in zip("zyx", self.shape, strict=True):
-            check_range(f"voxels along {axis}", n, 1, 1 << 14)
+            check_whole(f"number of voxels along {axis}", n, 1, 1 << 14)
 
     @classmethod
     def around(
@@ -142,7 +144,7 @@ class VoxelGrid:
     occupied : ndarray of bool, shape (nz, ny, nx)
         The object's voxels.
     method : str
-        How the voxels were carved.
+        How the voxels were carved: a name of `core.methods.METHODS`.
     seabed : SeabedSlope, optional
         How the seabed seems to slope; where that is believed, the grid was carved over it.
     """
@@ -154,6 +156,21 @@ class VoxelGrid:
     occupied: NDArray[np.bool_]
     method: str = "consensus"
     seabed: SeabedSlope | None = None
+
+    def __post_init__(self) -> None:
+        check_type("volume of the grid", self.volume, Volume, "a Volume")
+        method_named(self.method)
+        for name, kind in (("likelihood", np.floating), ("views", np.number), ("occupied", np.bool_)):
+            values = getattr(self, name)
+            check_type(f"{name} of the grid", values, np.ndarray, "an array of numpy")
+            if not np.issubdtype(values.dtype, kind):
+                wanted = kind.__name__.rstrip("_")
+                raise InputTypeError(f"{name} of the grid is {values.dtype}; expected {wanted}")
+            if values.shape != self.volume.shape:
+                raise GeometryError(
+                    f"{name} of the grid has shape {values.shape}; its volume says {self.volume.shape}"
+                    " (z, y, x)"
+                )
 
     def __repr__(self) -> str:
         nz, ny, nx = self.volume.shape

@@ -12,6 +12,12 @@ end can be waited for there, and it lives on if this process dies.
 
 Nothing is computed here by more than one thread. Libraries end their threads before a fork and start them
 after it; one that forks again at once can wait for ever for a thread that has just begun (scipy's FFT).
+
+Why not multiprocessing's ``forkserver`` with a preload: an interpreter has one, whose environment and
+preload are those of its first start, and two graphs in one process need two: domain, discovery range,
+keys and thread counts are environment that middleware and libraries read once. And its children's end is
+told by the server alone: if that dies, they count as failed while they live on (exit status 255), where
+here they are watched as before.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from csas_shadow_ros.core.errors import ParameterError
+from csas_shadow_ros.core.methods import METHODS
 from csas_shadow_ros.core.parameters import (
     MAX_OBJECTS,
     MOST_OBJECTS,
@@ -229,7 +230,7 @@ class ViewerNodeParameters(NodeParameters):
     port: int = bounded(8765, "serve the page on this port; 0: any free port", low=0, high=65535)
     token: str = bounded("auto", "ask for this token; auto: none on this machine, a new one on a network")
     method: str = bounded(
-        "consensus", "show the grid of voxel_carver's method", choices=("consensus", "hard", "soft")
+        "consensus", "show the grid of voxel_carver's method", choices=tuple(METHODS)
     )
 
 

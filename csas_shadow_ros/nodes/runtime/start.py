@@ -9,7 +9,10 @@ from __future__ import annotations
 import importlib
 import os
 import signal
+from collections.abc import Callable
 from functools import partial
+
+from csas_shadow_ros.node_table import NODES
 
 
 def run(name: str) -> int:
@@ -33,11 +36,8 @@ def run(name: str) -> int:
     return status
 
 
-sub_aperture = partial(run, "sub_aperture")
-shadow_enhancement = partial(run, "shadow_enhancement")
-shadow_likelihood = partial(run, "shadow_likelihood")
-voxel_carver = partial(run, "voxel_carver")
-composites = partial(run, "composites")
-bag_player = partial(run, "bag_player")
-bag_recorder = partial(run, "bag_recorder")
-viewer = partial(run, "viewer")
+def __getattr__(name: str) -> Callable[[], int]:
+    """Return the entry point of a node, which goes by the node's name."""
+    if name not in NODES:
+        raise AttributeError(f"there is no node {name!r}; expected one of: {', '.join(NODES)}")
+    return partial(run, name)
