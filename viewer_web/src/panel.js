@@ -221,7 +221,9 @@ export class Panel {
         const found = other && app.loader.bitmap(app.address(layer, other, "jpg"));
         if (found) return { about: other, view: other, wanted: quick, bitmap: found, late: true };
       }
-    return { about, view: about, wanted: quick, bitmap };
+    // Of a picture that was just zoomed out of, or moved: what there is of it, until the rest is decoded.
+    const part = bitmap ? undefined : app.loader.whatever(quick);
+    return { about, view: about, wanted: quick, bitmap: bitmap ?? part, partly: !!part };
   }
 
   draw() {
@@ -257,7 +259,7 @@ export class Panel {
       g.fillRect(0, 0, frame.side, frame.side);
       if (bitmap) {
         onto(about.A, other);
-        g.drawImage(bitmap, -0.5, -0.5);
+        g.drawImage(bitmap, (bitmap.part?.[0] ?? 0) - 0.5, (bitmap.part?.[1] ?? 0) - 0.5);
       }
       if (outline) {
         onto(outline.A, other);
@@ -320,7 +322,8 @@ export class Panel {
   }
 
   // Levels where the screen wants them, between their four neighbours, as greys. M: canvas → picture pixels.
-  levels(g, { codes, width, height }, [a, b, c, d, e, f], { radius, k }, outline) {
+  levels(g, { codes, width, height, part }, [a, b, left, d, e, top], { radius, k }, outline) {
+    const c = left - (part?.[0] ?? 0), f = top - (part?.[1] ?? 0);
     const side = g.canvas.width, half = side / 2, { grey } = this;
     this.screens ??= new Map();
     if (this.screens.size > 3) this.screens.clear();
