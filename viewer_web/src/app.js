@@ -144,6 +144,7 @@ class App {
     $("title").textContent = scene.title || "CSAS shadows";
     this.badge();
     $("follow-row").hidden = !scene.live;
+    document.body.classList.toggle("live", !!scene.live);
     for (const name of ["track", "target", "volumes", "dimensions", "pictures", "damage", "reduced", "contacts", "report", "other", "desk", "meshes"]) this.part(name);
     this.refetch();
     this.dirty();
@@ -684,13 +685,23 @@ class App {
     $("truth-row").hidden = this.truthRev === undefined;
   }
 
+  // A heading counts from the scene's x-axis; who reads the circle wants a true bearing. An object has no
+  // front: 0° to 180°.
+  withAxis(d) {
+    if (!Number.isFinite(d?.heading_rad)) return d;
+    const bears = (rad) => 90 + this.north - rad / RAD, [low, high] = d.intervals?.heading_rad ?? [];
+    const axis = ((bears(d.heading_rad) % 180) + 180) % 180, intervals = { ...d.intervals, ...(Number.isFinite(low) && Number.isFinite(high) ? { axis: [bears(high), bears(low)] } : {}) };
+    return { ...d, axis, intervals };
+  }
+
   // Of the chosen contact: what was measured, with the truth, the surface at the threshold, and a second run.
   dimensions() {
     const c = this.contact, target = !c || c.volume === "main";
-    const d = target ? this.scene.dimensions ?? c?.dimensions : c.dimensions;
+    const d = this.withAxis(target ? this.scene.dimensions ?? c?.dimensions : c.dimensions);
     // Beside a second run there is room for nothing else.
-    const o = this.mate, t = o ? null : target ? this.scene.truth : c.truth, m = target && !o ? this.surfaceMeasures : null, table = $("dimensions");
+    const o = this.withAxis(this.mate), t = o ? null : this.withAxis(target ? this.scene.truth : c.truth), m = target && !o ? this.surfaceMeasures : null, table = $("dimensions");
     table.replaceChildren();
+    table.classList.toggle("pair", !!o);
     const row = (cells, head) => {
       const tr = table.insertRow();
       cells.forEach((cell, i) => {
@@ -703,19 +714,19 @@ class App {
     if (!d && !m) return void row(["", c?.reason ?? (this.scene.volumes.main ? "carved; not measured yet" : this.scene.status || "nothing carved yet")]);
     row(["", "found, 95 %", ...(t ? ["truth"] : []), ...(m?.object ? ["surface here"] : []), ...(o ? ["run B", "B − A"] : [])], true);
     const deg = 1 / RAD, half = (one, key) => (one?.intervals?.[key] ? (one.intervals[key][1] - one.intervals[key][0]) / 2 : undefined);
-    const told = (v, i, digits, unit) => (v === undefined || v === null ? "—" : `${v.toFixed(digits)}${i === undefined ? "" : ` ± ${i.toFixed(digits)}`} ${unit}`);
-    const names = [["length_m", "Length", "m", 2, 1], ["width_m", "Width", "m", 2, 1], ["height_m", "Height", "m", 2, 1], ["volume_m3", "Volume", "m³", 3, 1], ["heading_rad", "Heading", "°", 1, deg]];
+    const told = (v, i, digits, unit) => (v === undefined || v === null ? "—" : `${v.toFixed(digits).padStart(unit === "°" ? 5 : 0, "0")}${i === undefined ? "" : ` ± ${i.toFixed(digits)}`} ${unit}`);
+    const names = [["length_m", "Length", "m", 2, 1], ["width_m", "Width", "m", 2, 1], ["height_m", "Height", "m", 2, 1], ["volume_m3", "Volume", "m³", 3, 1], ["axis", "Axis bears", "°", 1, 1]];
     for (const [key, label, unit, digits, by] of names) {
       const v = d?.[key], i = half(d, key);
       if (v === undefined && !m?.object) continue;
-      if (key === "heading_rad" && v === undefined) continue;
+      if (key === "axis" && v === undefined) continue;
       const cells = [label, told(v === undefined || v === null ? v : v * by, i === undefined ? i : i * by, digits, unit)];
       if (t) cells.push(t[key] === undefined || t[key] === null ? "" : told(t[key] * by, undefined, digits, unit));
       if (m?.object) cells.push(m[key] === undefined ? "" : told(m[key], undefined, digits, unit));
       if (o) {
         cells.push(told(o[key] === undefined ? undefined : o[key] * by, half(o, key) === undefined ? undefined : half(o, key) * by, digits, unit));
         let off = (o[key] ?? NaN) - v;
-        if (key === "heading_rad") off = Math.atan2(Math.sin(2 * off), Math.cos(2 * off)) / 2; // an object has no front
+        if (key === "axis") off = ((off + 270) % 180) - 90;
         // Two independent 95 % intervals: theirs of the difference.
         const both = i === undefined || half(o, key) === undefined ? undefined : Math.hypot(i, half(o, key));
         cells.push(Number.isFinite(off) ? [`${off > 0 ? "+" : ""}${(off * by).toFixed(digits)} ${unit}`, both !== undefined && Math.abs(off) > both ? "differs" : "agrees"] : "—");
