@@ -46,6 +46,8 @@ class BagIndex:
         for file in self.files:
             channels = {i for i, c in file.channels.items() if c.topic == topic}
             for place in file.places:
+                if not left:
+                    return
                 if not channels & place.channels:
                     continue
                 alone = place.start_ns == place.end_ns
