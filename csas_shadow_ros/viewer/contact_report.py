@@ -517,7 +517,7 @@ def _write_judgement(figure: Figure, sheet: Sheet) -> None:
 
 def _dimension_table(figure: Figure, sheet: Sheet, left: float) -> None:
     y = 0.335
-    columns = (left, left + 0.09, left + 0.275)
+    columns = (left, left + 0.105, left + 0.29)
     if not sheet.rows:
         figure.text(left, y, "No dimensions: nothing was measured.", va="top")
         return

@@ -227,8 +227,18 @@ export class Panel {
   draw() {
     if (!this.slider.side) return;
     this.found = this.find();
-    this.paint(this.frame);
+    if (this.slider.onPaper) this.print(this.frame);
+    else this.paint(this.frame);
     this.describe(this.found, this.found.view);
+  }
+
+  // A browser prints what is drawn on a canvas as lines and images, and none of the pixels that were put there;
+  // a circle that was cleared in the middle covers the picture with white. So both come as one image.
+  print(frame) {
+    const one = new OffscreenCanvas(frame.side, frame.side), { slider } = this;
+    this.paint({ ...frame, canvas: one });
+    if (!this.six) one.getContext("2d").drawImage(slider.ring, 0, 0);
+    slider.picture.getContext("2d", { alpha: false }).drawImage(one, 0, 0);
   }
 
   paint(frame) {
