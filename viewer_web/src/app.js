@@ -534,7 +534,7 @@ class App {
     if (ruler) {
       const m = this.measured(ruler);
       text = m.height === undefined ? `${m.distance.toFixed(2)} m; no height: ${m.why}`
-        : `${m.distance.toFixed(2)} m; shadow L = ${m.L.toFixed(2)} m → h = L · tan ψ = ${m.L.toFixed(2)} m × tan ${m.psi.toFixed(1)}° = ${m.height.toFixed(2)} m (ψ: grazing angle at the shadow's tip)`;
+        : `${m.distance.toFixed(2)} m; shadow L = ${m.L.toFixed(2)} m → h = L · tan ψ = ${m.L.toFixed(2)} m × tan ${m.psi.toFixed(1)}° = ${m.height.toFixed(2)} m (ψ at the shadow's tip)`;
     } else if (this.state.ruling) text = "Ruler: drag along a shadow, away from the sonar.";
     else text = this.panels[1].slider.told(this.current?.aspect_deg);
     if ($("measured").textContent !== text) $("measured").textContent = text;
