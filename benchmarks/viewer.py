@@ -2,14 +2,17 @@
 
     python benchmarks/viewer.py                          # 360 synthetic views of 800 x 800, two sets
     python benchmarks/viewer.py --results results/demo   # and how fast a finished run opens
+    python benchmarks/viewer.py --against ../old/csas_shadow_ros/viewer/static   # and another build's page
 
-Reports; asserts nothing. Meant for a machine that is otherwise idle.
+Two builds are dragged in turn, so that both meet what else the machine does. Reports; asserts nothing.
+Views a second are meant for a machine that is otherwise idle; what a view costs the processor is not.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import json
 import math
 import os
@@ -18,6 +21,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +33,13 @@ from numpy.typing import NDArray
 from csas_shadow_ros.core.geometry import Acoustics, ShadowCamera, ViewInfo, view_ground_to_pixel
 from csas_shadow_ros.core.imaging.masks import MASK_SHADOW
 from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
+from csas_shadow_ros.viewer import server as served
 from csas_shadow_ros.viewer.codes import amplitude_codes
 from csas_shadow_ros.viewer.server import ViewerServer
 from csas_shadow_ros.viewer.store import Entry, ViewStore
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "viewer"))
-from browser import ARGUMENTS, Watched, launched
+from browser import ARGUMENTS, CHROMIUM, Watched, launched
 
 #: The tests have pages drawn by an emulated GPU, so that they take the ways that a real one takes. The
 #: browser by itself does not: without a GPU it draws pages in main memory, and emulates one for 3-D alone.
@@ -121,12 +126,25 @@ def spread(values: list[float]) -> dict[str, float]:
     return {"median": round(float(np.median(values)), 1), "p95": round(float(np.percentile(values, 95)), 1)}
 
 
+def processes(browser: Any) -> list[dict[str, Any]]:
+    """Return the browser's processes."""
+    cdp = browser.new_browser_cdp_session()
+    return list(cdp.send("SystemInfo.getProcessInfo")["processInfo"])
+
+
+def processor_s(browser: Any) -> float:
+    """Return the processor's time that the browser's processes have had (Linux), s."""
+    total = 0
+    for process in processes(browser):
+        told = Path(f"/proc/{process['id']}/stat").read_text().rsplit(")", 1)[1].split()
+        total += int(told[11]) + int(told[12])
+    return total / os.sysconf("SC_CLK_TCK")
+
+
 def memory_mb(browser: Any) -> float:
     """Return the resident memory of the renderer processes (Linux), MB."""
-    cdp = browser.new_browser_cdp_session()
-    processes = cdp.send("SystemInfo.getProcessInfo")["processInfo"]
     total = 0
-    for process in processes:
+    for process in processes(browser):
         if process["type"] == "renderer":
             status = Path(f"/proc/{process['id']}/status").read_text()
             total += int(status.split("VmRSS:")[1].split()[0])
@@ -157,19 +175,31 @@ async def _drag(port: int, circle: list[float]) -> None:
 
 def scrub(watched: Watched, port: int, panel: int = 1) -> dict[str, Any]:
     """Drag the cursor once round a panel's circle in six seconds, `DRAGS` times; return what is typical."""
-    drags = [_scrubbed(watched, port, panel) for _ in range(DRAGS)]
-    rate, median, p95 = (round(float(np.median(column)), 1) for column in zip(*drags, strict=True))
+    return told_of([_scrubbed(watched, port, panel) for _ in range(DRAGS)])
+
+
+def told_of(drags: list[tuple[float, ...]]) -> dict[str, Any]:
+    """Return what is typical of drags, and each of them."""
+    rate, median, p95, cost, _ = (round(float(np.median(column)), 1) for column in zip(*drags, strict=True))
     return {
-        "mouse_events_per_s": MOUSE_HZ,
         "views_per_s": rate,
-        "views_per_s_of_each_drag": [drag[0] for drag in drags],
         "event_to_picture_ms": {"median": median, "p95": p95},
-        "p95_ms_of_each_drag": [drag[2] for drag in drags],
+        "processor_ms_per_view": cost,
+        "of_each_drag": {
+            "views_per_s": [drag[0] for drag in drags],
+            "p95_ms": [drag[2] for drag in drags],
+            "processor_ms_per_view": [drag[3] for drag in drags],
+            "machine_load": [drag[4] for drag in drags],
+        },
     }
 
 
-def _scrubbed(watched: Watched, port: int, panel: int) -> tuple[float, float, float]:
-    """Drag once; return views a second, and median and 95th percentile (ms) of event to picture."""
+def _scrubbed(watched: Watched, port: int, panel: int) -> tuple[float, float, float, float, float]:
+    """Drag once.
+
+    Returns views a second, median and 95th percentile (ms) of event to picture, the browser's processor time
+    (ms) a view, and the machine's load (processes that run or wait for a core, over the last minute).
+    """
     circle = watched.js(
         f"(() => {{ const s = csas.panels[{panel}].slider, b = s.ring.getBoundingClientRect();"
         " return [b.left + s.side / 2, b.top + s.side / 2, s.radius]; })()"
@@ -179,45 +209,88 @@ def _scrubbed(watched: Watched, port: int, panel: int) -> tuple[float, float, fl
     mouse.down()
     watched.page.wait_for_timeout(800)
     watched.js("csas.stats.drawn = 0, csas.stats.latency = []")
-    began = time.perf_counter()
+    browser = watched.page.context.browser
+    had, began = processor_s(browser), time.perf_counter()
     hand = threading.Thread(target=lambda: asyncio.run(_drag(port, circle)))
     hand.start()
     hand.join()
     took = time.perf_counter() - began
     drawn, latency = watched.js("[csas.stats.drawn, csas.stats.latency]")
+    cost = 1e3 * (processor_s(browser) - had) / max(1, drawn)
     mouse.up()
     times = spread(latency)
-    return round(drawn / took, 1), times["median"], times["p95"]
+    rate = round(drawn / took, 1)
+    return rate, times["median"], times["p95"], round(cost, 1), round(os.getloadavg()[0], 1)
+
+
+@contextlib.contextmanager
+def page_of(store: ViewStore, static: Path, browser: Any) -> Iterator[tuple[Watched, dict[str, Any]]]:
+    """Open a store's page, of the build in a folder; yield it with what its opening took."""
+    own, served.STATIC = served.STATIC, static
+    try:
+        server = ViewerServer(store)
+        server.start()
+        watched = Watched(browser.new_page(viewport={"width": 1366, "height": 768}))
+        watched.open(server.url)
+    finally:
+        served.STATIC = own
+    try:
+        out = {"first_picture_ms": round(watched.js("csas.stats.first"))}
+        loaded(watched)
+        out["memory_mb_all_views_loaded"] = round(memory_mb(browser))
+        yield watched, out
+    finally:
+        server.stop()
+
+
+def loaded(watched: Watched) -> None:
+    """Wait until a page has all views, and, left alone, has decoded what it decodes ahead."""
+    watched.until("csas.loader.all.length === 0 && csas.loader.busy.size === 0", 300)
+    if watched.js("!!csas.idle"):
+        watched.until("csas.idle() && !csas.loader.ahead.length && csas.loader.busy.size === 0", 300)
+
+
+def compared(store: ViewStore, static: Path) -> dict[str, Any]:
+    """Drag the page of this build and that of another in turn: A B A B ..."""
+    ports = (free_port(), free_port())
+    with contextlib.ExitStack() as stack:
+        first = stack.enter_context(launched(f"--remote-debugging-port={ports[0]}"))
+        given = [*ARGUMENTS, f"--remote-debugging-port={ports[1]}"]
+        second = first.browser_type.launch(executable_path=CHROMIUM, args=given)
+        stack.callback(second.close)
+        folders = (served.STATIC, static)
+        opens = zip(folders, (first, second), strict=True)
+        pages = [stack.enter_context(page_of(store, *each))[0] for each in opens]
+        drags: list[list[tuple[float, ...]]] = [[], []]
+        for _ in range(DRAGS):
+            for watched, port, of in zip(pages, ports, drags, strict=True):
+                of.append(_scrubbed(watched, port, 1))
+    return {"this": told_of(drags[0]), "against": told_of(drags[1])}
 
 
 def measure(store: ViewStore) -> dict[str, Any]:
     """Open a store's page; scrub, and move the threshold."""
-    server = ViewerServer(store)
-    server.start()
-    out: dict[str, Any] = {}
-    try:
-        port = free_port()
-        with launched(f"--remote-debugging-port={port}") as browser:
-            watched = Watched(browser.new_page(viewport={"width": 1366, "height": 768}))
-            watched.open(server.url)
-            out["first_picture_ms"] = round(watched.js("csas.stats.first"))
-            watched.until("csas.loader.all.length === 0 && csas.loader.busy.size === 0", 300)
-            out["memory_mb_all_views_loaded"] = round(memory_mb(browser))
-            out["scrub"] = scrub(watched, port)
-            watched.js("csas.panels[1].choose('six_shadow')")
-            watched.until("csas.panels[1].sixWanted?.every(a => csas.loader.bitmap(a))")
-            out["scrub_beside_six_views"] = scrub(watched, port, 0)
-            watched.js("csas.panels[1].choose('shadow'), csas.turn()")
-            out["scrub_sonar_up"] = scrub(watched, port, 0)
-            watched.js("csas.turn()")
-            watched.until("!csas.busySurface && csas.stats.surfaces.length > 0", 30)
-            watched.js("csas.stats.surfaces = []")
-            for step in range(40):
-                watched.js(f"csas.threshold('main', {90 + step % 20})")
-                watched.page.wait_for_timeout(200)
-            out["threshold_to_surface_ms"] = spread(watched.js("csas.stats.surfaces"))
-    finally:
-        server.stop()
+    port = free_port()
+    opening = launched(f"--remote-debugging-port={port}")
+    with opening as browser, page_of(store, served.STATIC, browser) as (watched, out):
+        out["scrub"] = scrub(watched, port)
+        # Just zoomed out of: nothing that is decoded covers what is shown.
+        watched.js("csas.state.zoom /= 1.5, csas.dirty()")
+        out["scrub_just_zoomed_out"] = told_of([_scrubbed(watched, port, 1)])
+        watched.js("csas.state.zoom *= 1.5, csas.dirty()")
+        loaded(watched)
+        watched.js("csas.panels[1].choose('six_shadow')")
+        watched.until("csas.panels[1].sixWanted?.every(a => csas.loader.bitmap(a))")
+        out["scrub_beside_six_views"] = scrub(watched, port, 0)
+        watched.js("csas.panels[1].choose('shadow'), csas.turn()")
+        out["scrub_sonar_up"] = scrub(watched, port, 0)
+        watched.js("csas.turn()")
+        watched.until("!csas.busySurface && csas.stats.surfaces.length > 0", 30)
+        watched.js("csas.stats.surfaces = []")
+        for step in range(40):
+            watched.js(f"csas.threshold('main', {90 + step % 20})")
+            watched.page.wait_for_timeout(200)
+        out["threshold_to_surface_ms"] = spread(watched.js("csas.stats.surfaces"))
     return out
 
 
@@ -238,8 +311,8 @@ def opened(results: Path) -> dict[str, Any]:
                 watched.until("window.csas && csas.stats.first > 0", 60)
                 out["command_to_picture_ms"] = round(1e3 * (time.perf_counter() - began))
                 out["page_to_picture_ms"] = round(watched.js("csas.stats.first"))
-                watched.until("csas.scene.volumes.main && csas.loader.all.length === 0", 300)
-                watched.until("csas.loader.busy.size === 0", 300)
+                watched.until("csas.scene.volumes.main", 300)
+                loaded(watched)
                 out["views"] = watched.js("csas.views('shadow').length")
                 out["memory_mb_all_views_loaded"] = round(memory_mb(browser))
             finally:
@@ -252,9 +325,13 @@ def main() -> int:
     layout = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
     parser.add_argument("--results", type=Path, help="a results folder to open as well")
+    parser.add_argument("--against", type=Path, help="the folder `static` of another build, dragged in turn")
     arguments = parser.parse_args()
-    report: dict[str, Any] = {"cores": os.cpu_count(), "load": round(os.getloadavg()[0], 2)}
-    report["synthetic"] = measure(synthetic_store())
+    report: dict[str, Any] = {"cores": os.cpu_count(), "machine_load_before": round(os.getloadavg()[0], 2)}
+    store = synthetic_store()
+    if arguments.against is not None:
+        report["in_turn"] = compared(store, arguments.against.resolve())
+    report["synthetic"] = {"mouse_events_per_s": MOUSE_HZ, **measure(store)}
     if arguments.results is not None:
         times = [opened(arguments.results) for _ in range(OPENINGS)]
         report["results"] = {name: round(float(np.median([t[name] for t in times]))) for name in times[0]}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from msg_adapters.messages import stamp_to_ns
@@ -35,28 +35,30 @@ class BagIndex:
             raise BagError(f"{reader.path} has no index; expected a complete MCAP bag")
         self.files = files
 
-    def places(self, stream_name: str, stamps: set[int]) -> dict[int, Callable[[], Any]]:
-        """Return for each stamp a function that reads its image message.
+    def places(self, stream_name: str, stamps: set[int]) -> Iterator[tuple[int, Callable[[], Any]]]:
+        """Iterate stamps, each once, with a function that reads its image message.
 
         A chunk whose only message of the stream was logged at its own stamp is found without being read;
-        the others are read once.
+        the others, as of a bag that a recorder wrote, are read once, on the way.
         """
         topic = absolute_name(stream(stream_name).image_topic, self.reader.namespace)
-        found: dict[int, Callable[[], Any]] = {}
+        left = set(stamps)
         for file in self.files:
             channels = {i for i, c in file.channels.items() if c.topic == topic}
             for place in file.places:
+                if not left:
+                    return
                 if not channels & place.channels:
                     continue
                 alone = place.start_ns == place.end_ns
-                if alone and place.start_ns in stamps:
+                if alone and place.start_ns in left:
                     held = [place.start_ns]
                 else:
                     held = [stamp for stamp, _ in self._at(file, place, channels, topic)]
                 for stamp in held:
-                    if stamp in stamps:
-                        found.setdefault(stamp, self._loader(file, place, channels, topic, stamp))
-        return found
+                    if stamp in left:
+                        left.remove(stamp)
+                        yield stamp, self._loader(file, place, channels, topic, stamp)
 
     def _loader(
         self, file: McapFile, place: Place, channels: set[int], topic: str, stamp: int

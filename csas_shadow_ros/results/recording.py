@@ -110,7 +110,7 @@ def _show_views(
             for _, message, stamp in checked_messages(reader, stream(stage).info_topic, lambda _: None):
                 if stamp in stamps:
                     infos[stamp] = message
-            for stamp, read in index.places(stage, set(infos)).items():
+            for stamp, read in index.places(stage, set(infos)):
                 with contextlib.suppress(CsasError):  # named by the node that refused it
                     shown[stamp][stage] = view_from_msgs(read(), infos[stamp], stage)
     for stages in shown.values():

@@ -28,9 +28,10 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..core.imaging.masks import MASK_SHADOW
 from ..core.shape.mesh import mesh_from_grid
+from .contacts import axis_bearing_deg
 from .crop import HIGH_SHOWN_DB as _HIGH
 from .crop import LOW_SHOWN_DB as _LOW
-from .crop import Window, cast, contact_named, grey_of, outlines, shadow_m
+from .crop import Window, cast, contact_named, grey_of, outlines, shadow_m, to_north
 from .server import STATIC
 from .store import Entry, ViewStore
 
@@ -57,7 +58,6 @@ _ROWS = (
     ("Width", "width_m", "m", 2),
     ("Height", "height_m", "m", 2),
     ("Volume", "volume_m3", "m³", 3),
-    ("Heading", "heading_rad", "°", 1),
 )
 _LEGEND = (
     f"Amber: segmented shadow. Blue: shadow that the shape casts. Grey: {_LOW:g} to +{_HIGH:g} dB over the"
@@ -94,12 +94,21 @@ def _value(d: Mapping[str, Any], key: str, unit: str, digits: int, *, interval: 
     value = d.get(key)
     if value is None:
         return "—"
-    by = math.degrees(1.0) if unit == "°" else 1.0
-    text = f"{value * by:.{digits}f}"
+    text = f"{value:.{digits}f}"
     between = (d.get("intervals") or {}).get(key)
     if interval and between and None not in between:
-        text += f" ± {(between[1] - between[0]) / 2 * by:.{digits}f}"
+        text += f" ± {(between[1] - between[0]) / 2:.{digits}f}"
     return f"{text} {unit}"
+
+
+def _axis(d: Mapping[str, Any], north: float) -> str:
+    if d.get("heading_rad") is None:
+        return "—"
+    text = f"{axis_bearing_deg(d['heading_rad'], north):05.1f}"
+    between = (d.get("intervals") or {}).get("heading_rad")
+    if between and None not in between:
+        text += f" ± {math.degrees(between[1] - between[0]) / 2:.1f}"
+    return f"{text} °"
 
 
 def _position(contact: Mapping[str, Any]) -> str:
@@ -190,6 +199,11 @@ def sheet_of(store: ViewStore, contact: str = "") -> Sheet:
         if dimensions.get(key) is not None:
             row = [label, _value(dimensions, key, unit, digits)]
             rows.append(row + ([_value(truth, key, unit, digits, interval=False)] if truth else []))
+    if dimensions.get("heading_rad") is not None:
+        north = float(report.get("north_deg") or 0.0)
+        rows.append(["Axis bears", _axis(dimensions, north)])
+        if truth:
+            rows[-1].append(_axis({**truth, "intervals": None}, north))
     quality = report.get("quality") or {"verdict": "", "reasons": []}
     reasons = [str(r) for r in quality["reasons"]]
     if report.get("why_no_object"):
@@ -288,7 +302,10 @@ def _add_pictures(
         )
     if "color_by_aspect" in store.pictures:
         sheet.pictures.append(
-            ("Colour by aspect, north up", lambda axes: _draw_colours(axes, store, contact))
+            (
+                "Colour by aspect, north up",
+                lambda axes: _draw_colours(axes, store, contact, float(report.get("north_deg") or 0.0)),
+            )
         )
     if mesh is not None:
         heading = float((contact.get("dimensions") or {}).get("heading_rad") or 0.0)
@@ -345,13 +362,14 @@ def _draw_shadow(
     )
 
 
-def _draw_colours(axes: Any, store: ViewStore, contact: Mapping[str, Any]) -> None:
+def _draw_colours(axes: Any, store: ViewStore, contact: Mapping[str, Any], north: float) -> None:
     info, _, pixels = store.pictures["color_by_aspect"]
-    window = Window(contact["position_m"], _ROUND * contact["size_m"], (0.0, 1.0), _PICTURE_PX)
+    up = to_north(north)
+    window = Window(contact["position_m"], _ROUND * contact["size_m"], up, _PICTURE_PX)
     _picture(axes, window, window.cut(info.grid.ground_to_pixel, pixels, 255))
     wheel = axes.inset_axes((0.8, 0.8, 0.19, 0.19))
     y, x = np.mgrid[1:-1:120j, -1:1:120j]
-    hue = (np.arctan2(y, x) / math.tau) % 1.0
+    hue = (np.arctan2(y, x) / math.tau + north / 360.0) % 1.0
     ring = np.hypot(x, y)
     rgb = mpl.colors.hsv_to_rgb(np.dstack([hue, np.ones_like(hue), np.ones_like(hue)]))
     alpha = ((ring < 1) & (ring > 0.5)).astype(float)
@@ -499,7 +517,7 @@ def _write_judgement(figure: Figure, sheet: Sheet) -> None:
 
 def _dimension_table(figure: Figure, sheet: Sheet, left: float) -> None:
     y = 0.335
-    columns = (left, left + 0.09, left + 0.275)
+    columns = (left, left + 0.105, left + 0.29)
     if not sheet.rows:
         figure.text(left, y, "No dimensions: nothing was measured.", va="top")
         return

@@ -33,6 +33,28 @@ def north_deg(report: Mapping[str, Any]) -> float:
     return float(heading) if isinstance(heading, int | float) and math.isfinite(heading) else 0.0
 
 
+def axis_bearing_deg(heading_rad: float, north_deg: float = 0.0) -> float:
+    """Return the true bearing, 0° up to 180°, of an axis that heads somewhere in the scene.
+
+    An object has no front: its other end bears 180° more.
+
+    Parameters
+    ----------
+    heading_rad : float
+        Counter-clockwise from the scene's +x, as in ``report.json``.
+    north_deg : float
+        Of :func:`north_deg`.
+
+    Examples
+    --------
+    >>> axis_bearing_deg(0.0)
+    90.0
+    >>> axis_bearing_deg(3.0 * math.pi / 4.0, north_deg=10.0)
+    145.0
+    """
+    return (90.0 + north_deg - math.degrees(heading_rad)) % 180.0
+
+
 def contacts_of(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return what an operator decides on: every object, the target first, then what was left out.
 
@@ -100,4 +122,4 @@ def about(report: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-__all__ = ["about", "contacts_of", "geographic", "north_deg"]
+__all__ = ["about", "axis_bearing_deg", "contacts_of", "geographic", "north_deg"]

@@ -155,6 +155,12 @@ def cast(mesh: trimesh.Trimesh, info: ViewInfo, window: Window) -> list[NDArray[
     return [line[:, 0].astype(np.float64) for line in found if len(line) >= 3]
 
 
+def to_north(north_deg: float) -> tuple[float, float]:
+    """Return the scene's direction of true north, which lies so many degrees counter-clockwise from +y."""
+    north = math.radians(north_deg)
+    return -math.sin(north), math.cos(north)
+
+
 def moving_picture(store: ViewStore, name: str = "shadow", contact: str = "") -> bytes:
     """Make a GIF of the circle round a contact, north up: each view with where the sonar is.
 
@@ -179,7 +185,8 @@ def moving_picture(store: ViewStore, name: str = "shadow", contact: str = "") ->
     views = views[:: math.ceil(len(views) / _FRAMES)]
     reach = 1.15 * (about["size_m"] / 2 + max(shadow_m(e.info, about) for e in views))
     room = 22
-    window = Window(about["position_m"], 2 * reach, (0.0, 1.0), _GIF_PX - 2 * room)
+    north = float((store.scene()["report"] or {}).get("north_deg") or 0.0)
+    window = Window(about["position_m"], 2 * reach, to_north(north), _GIF_PX - 2 * room)
     radius, middle = window.pixels / 2, _GIF_PX / 2
     rows, cols = np.ogrid[: window.pixels, : window.pixels]
     inside = (rows - radius + 0.5) ** 2 + (cols - radius + 0.5) ** 2 < (radius - 1) ** 2
@@ -187,7 +194,6 @@ def moving_picture(store: ViewStore, name: str = "shadow", contact: str = "") ->
     greys = [(v, v, v) for v in np.linspace(0, 255, _GREYS).round().astype(int).tolist()]
     palette = Image.new("P", (1, 1))
     palette.putpalette([v for colour in (*greys, _GREEN, _AMBER, _RING, _BACKGROUND) for v in colour])
-    north = float((store.scene()["report"] or {}).get("north_deg") or 0.0)
     for entry in views:
         picture = Image.fromarray(grey_of(window, entry, SETS[name])).convert("RGB")
         draw = ImageDraw.Draw(picture)
@@ -199,7 +205,8 @@ def moving_picture(store: ViewStore, name: str = "shadow", contact: str = "") ->
         ring = radius + 8
         draw.ellipse((middle - ring, middle - ring, middle + ring, middle + ring), outline=_RING, width=4)
         aspect = entry.info.aspect_rad
-        x, y = middle + ring * math.cos(aspect), middle - ring * math.sin(aspect)
+        at = aspect - math.radians(north)
+        x, y = middle + ring * math.cos(at), middle - ring * math.sin(at)
         draw.ellipse((x - 9, y - 9, x + 9, y + 9), fill=_GREEN)
         bearing = round(90.0 + north - math.degrees(aspect)) % 360
         draw.text((6, _GIF_PX - 20), f"sonar bears {bearing:03d}°", fill="white", font=font)
@@ -221,4 +228,4 @@ def _round_length(goal_m: float) -> float:
     return next(m * ten for m in (5.0, 2.0, 1.0) if m * ten <= goal_m)
 
 
-__all__ = ["Window", "cast", "contact_named", "grey_of", "moving_picture", "outlines", "shadow_m"]
+__all__ = ["Window", "cast", "contact_named", "grey_of", "moving_picture", "outlines", "shadow_m", "to_north"]

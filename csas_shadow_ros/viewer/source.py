@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import threading
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -280,6 +281,7 @@ class PathSource:
         """Register what can be read at once; the rest goes on in a thread."""
         # What is found comes first: a page that is open already would say that there is nothing.
         self._findings()
+        self.store.put_part("progress", {"state": "loading"})
         first = [s for s in ("shadow", "sub_aperture") if s in self._held] or self._held[:1]
         try:
             index: BagIndex | None = BagIndex(self._reader)
@@ -287,14 +289,14 @@ class PathSource:
             log.info("%s", error)  # read from end to end instead: damage is named on the way
             index = None
         if index is not None:
-            for name in first:
-                self._register(index, name)
+            # In turn: both pictures have their own layer from the first view on.
+            for _ in itertools.zip_longest(*(self._register(index, name) for name in first)):
+                pass
         self._small_parts()
-        self.store.put_part("progress", {"state": "loading"})
         self._thread = threading.Thread(target=self._rest, args=(index, first), name="viewer", daemon=True)
         self._thread.start()
 
-    def _register(self, index: BagIndex, name: str) -> None:
+    def _register(self, index: BagIndex, name: str) -> Iterator[None]:
         infos = {}
         for _, message, stamp in checked_messages(self._reader, STREAMS[name].info_topic, self._problem):
             try:
@@ -303,12 +305,14 @@ class PathSource:
                 self._problem(f"{STREAMS[name].info_topic}: {error}")
         stat = Path(self._bag).stat()
         revision = f"{(stat.st_mtime_ns ^ stat.st_size) & 0xFFFFFFFF:08x}"
-        for stamp, read in sorted(index.places(name, set(infos)).items()):
+        # Each as it is found: where a recorder wrote the bag, they are found by reading all of it.
+        for stamp, read in index.places(name, set(infos)):
 
             def load(read: Callable[[], Any] = read, name: str = name) -> NDArray[np.uint8]:
                 return codes_of(name, image_from_msg(read(), name))
 
             self.store.put_view(name, Entry(infos[stamp], revision, load))
+            yield
 
     def _findings(self) -> None:
         store = self.store
@@ -394,7 +398,8 @@ class PathSource:
                 for view in self._sequential(name):
                     self.store.put_view(name, spooled(self._spool, name, view))
             elif name not in first:
-                self._register(index, name)
+                for _ in self._register(index, name):
+                    pass
 
     def _shape(self) -> None:
         shape = Shape(self.store, replace(self.parameters.carving, threshold=0.0))

@@ -280,7 +280,7 @@ def read(path: Path) -> tuple[list[Message], list[str], bool]:
         views = BagViews(reader, stage)
         for stamp in views.times:
             views.get(stamp)
-        for load in BagIndex(reader).places("likelihood", set(views.times)).values():
+        for _, load in BagIndex(reader).places("likelihood", set(views.times)):
             load()
     except CsasError:
         pass  # what cannot be used is refused; what was read counts

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import math
 import subprocess
 import sys
 import threading
@@ -255,15 +256,17 @@ def test_the_report_is_one_page_with_the_judgement_the_dimensions_and_the_damage
     shutil.copytree(results, folder)
     report = json.loads((folder / "report.json").read_text())
     report["views"] |= {"lost": 3, "rejected": 2, "reasons": {"too <dark>": 2}}
+    report["datum"] = {"heading_deg": 30.0}
     report["objects"][0] |= {"place": {"latitude_deg": -60.5, "longitude_deg": 5.25}}
     (folder / "report.json").write_text(json.dumps(report))
     Desk(folder).change([judged("mine-like", remark="fins & <b>")])
     page, sheet = tmp_path / "r.html", tmp_path / "r.pdf"
     assert main(["report", str(folder), "--out", str(page), "-q"]) == 0
     text = page.read_text(encoding="utf-8")
-    length = report["dimensions"]["length_m"]
+    length, axis = report["dimensions"]["length_m"], math.degrees(report["dimensions"]["heading_rad"])
     for told in ("mine-like", "judged by A", "fins &amp; &lt;b&gt;", f"{length:.2f} ± ", "3 views lost",
-                 "2 rejected: too &lt;dark&gt;", "60.500000° S, 5.250000° E", "csas-shadow"):  # fmt: skip
+                 "2 rejected: too &lt;dark&gt;", "60.500000° S, 5.250000° E", "csas-shadow",
+                 f"{(120 - axis) % 180:05.1f} ± "):  # fmt: skip
         assert told in text, told
     assert text.count("<img ") == 5
     assert "http:" not in text

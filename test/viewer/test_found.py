@@ -86,6 +86,25 @@ def test_the_badge_says_how_far_the_run_is_and_that_the_graph_is_gone(watched, s
     assert "36 of 90" in badge(watched)
 
 
+@pytest.mark.parametrize("live", [False, True])
+def test_what_changes_by_itself_moves_no_button(watched, serve, live):
+    store = ViewStore(title="a run of the eastern approach", live=live)
+    for i in range(36):
+        store.put_view("shadow", entry(i))
+    watched.open(serve(store))
+    where = "['#play', '#orientation', '#help-open', '#panel-a'].map(q => { const b = document.querySelector(q).getBoundingClientRect(); return [b.x, b.y]; })"
+    at, told = watched.js(where), set()
+    progress = {"views": 1036, "of": 2090, "rate": 12.5, "newest_s": 61, "silent_s": 61}
+    for state in ("loading", "running", "silent", "waiting", "finished"):
+        watched.js(
+            f"csas.notice({{type: 'part', part: 'progress', value: {json.dumps(progress | {'state': state})}}})"
+        )
+        watched.drawn()
+        told.add(badge(watched))
+        assert watched.js(where) == at, state
+    assert len(told) == (5 if live else 2)
+
+
 def test_an_object_that_is_drawn_is_not_said_to_be_missing(watched, serve, run_store):
     store = ViewStore(title="restarted", live=True)
     store.put_view("shadow", entry(0))
@@ -189,6 +208,40 @@ def cursor(watched: Any) -> tuple[float, float]:
         if (d.width < 10 || Math.abs(Math.hypot(x, y) - s.radius) > 1) throw new Error(`no cursor on the circle: ${d.width} px, ${Math.hypot(x, y)} off`);
         return Math.atan2(y, x) * 180 / Math.PI; })()"""
     )
+
+
+def test_north_up_has_true_north_up(watched, serve):
+    store = ViewStore(title="turned")
+    for i in range(COUNT):
+        store.put_view("shadow", entry(i))
+    store.put_part(
+        "report", {"verdict": "object", "quality": None, "heights": [], "rejected": [], "north_deg": 30.0}
+    )
+    d = {"length_m": 1.0, "width_m": 0.5, "height_m": 0.4, "volume_m3": 0.1, "heading_rad": math.radians(120)}
+    one = {
+        "id": "object-1",
+        "name": "Contact 1",
+        "kind": "object",
+        "position_m": [0, 0],
+        "size_m": 1,
+        "height_m": 0.4,
+    }
+    store.put_part("contacts", [one | {"dimensions": d, "volume": "main", "geographic": None}])
+    watched.open(serve(store))
+    watched.settle()
+    # North lies 30° counter-clockwise of the scene's +y: there the picture is turned back to, with its ring.
+    up = watched.js(
+        "(() => { const p = csas.panels[1], o = p.onCanvas([0, 0]), [x, y] = p.onCanvas([-Math.sin(Math.PI / 6), Math.cos(Math.PI / 6)]); return [x - o[0], y - o[1]]; })()"
+    )
+    assert up[0] == pytest.approx(0, abs=1e-6)
+    assert up[1] < -1
+    watched.js("csas.setAspect(120)")
+    watched.settle()
+    assert cursor(watched) == pytest.approx(90, abs=1)
+    assert "sonar bears 000.0°" in watched.page.locator("#where").inner_text()
+    # What heads for 120° in the scene lies along true north.
+    row = watched.page.locator("#dimensions tr", has_text="Axis bears").inner_text()
+    assert "000.0 °" in row
 
 
 def test_sonar_up_turns_the_circle_with_the_picture(watched, serve):

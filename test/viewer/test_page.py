@@ -472,6 +472,30 @@ def test_the_cursor_is_on_paper_too(watched, serve):
     assert watched.js(green) == 0
 
 
+def test_pictures_come_on_paper_as_images_with_their_circle(watched, serve):
+    """A browser prints no pixels that were put on a canvas, and prints a cleared circle over it as white."""
+    watched.open(serve(store_of()))
+    watched.js("csas.state.top = 31, csas.state.range = 60, csas.setAspect(180)")
+    watched.settle()
+    watched.js(
+        """(() => { csas.put = 0; const picture = csas.panels[1].slider.picture, g = picture.getContext('2d'), put = g.putImageData.bind(g);
+        g.putImageData = (...a) => { csas.put++; put(...a); }; })()"""
+    )
+    at = "(() => { const p = csas.panels[1].slider, c = p.picture, k = c.width / p.side, [x, y] = p.cursor, g = c.getContext('2d'); return [[c.width / 2 + 20, c.height / 2 + 33], [x * k, y * k]].map(q => [...g.getImageData(...q, 1, 1).data].slice(0, 3)); })()"
+    middle, _ = watched.js(at)
+    assert middle[0] > 20
+    watched.js("dispatchEvent(new Event('beforeprint'))")
+    assert watched.js("csas.put") == 0
+    assert watched.js(at) == [middle, [41, 216, 90]]
+    watched.page.emulate_media(media="print")
+    assert watched.js("getComputedStyle(csas.panels[1].slider.ring).visibility") == "hidden"
+    watched.page.emulate_media(media="screen")
+    watched.js("dispatchEvent(new Event('afterprint'))")
+    watched.drawn()
+    assert watched.js("csas.put") > 0
+    assert watched.js(at)[1] != [41, 216, 90]
+
+
 def test_after_a_click_on_a_box_or_a_button_the_keys_still_work(watched, serve):
     watched.open(serve(store_of()))
     page = watched.page

@@ -14,9 +14,12 @@ from urllib.parse import urlparse
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from synthetic import entry
 
 from csas_shadow_ros.bags import BagReader, BagWriter, read_run
+from csas_shadow_ros.bags.index import BagIndex
 from csas_shadow_ros.cli import main
 from csas_shadow_ros.core.parameters import SubApertureParameters
 from csas_shadow_ros.core.shape.mesh import mesh_from_grid
@@ -258,3 +261,30 @@ def test_a_page_that_has_stopped_reading_keeps_no_socket_open() -> None:
         assert stuck.recv(1) == b"H"
         server.stop()
         gc.collect()  # what is left open warns when it is collected, and a warning fails a test
+
+
+def test_the_first_views_of_a_recorded_bag_are_there_before_the_rest_is_read(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recorder logs messages later than they are stamped: where a view lies tells only the view itself."""
+    with (results / "result.mcap").open("rb") as file, (tmp_path / "r.mcap").open("wb") as made:
+        writer = Writer(made, chunk_size=1000)
+        writer.start(profile="ros2")
+        channels: dict[str, int] = {}
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
+            if channel.topic not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", known)
+            late = message.log_time + 7
+            writer.add_message(channels[channel.topic], late, message.data, message.publish_time)
+        writer.finish()
+    told: list[str] = []
+    at, put = BagIndex._at, ViewStore.put_view
+    monkeypatch.setattr(BagIndex, "_at", staticmethod(lambda *a: told.append("read") or at(*a)))
+    monkeypatch.setattr(ViewStore, "put_view", lambda s, name, view: told.append(name) or put(s, name, view))
+    source = PathSource(ViewStore(), tmp_path / "r.mcap")
+    source.start()
+    assert source.done.wait(60)
+    assert told[:4] == ["read", "shadow", "read", "sub_aperture"]
+    assert [told.count(name) for name in ("shadow", "sub_aperture", "likelihood")] == [72, 72, 72]

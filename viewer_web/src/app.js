@@ -6,6 +6,10 @@ import { Solid } from "./solid.js";
 const $ = (id) => document.getElementById(id);
 const DEFAULTS = { aspect: 0, layers: ["sub_aperture", "shadow"], zoom: 1, centre: [0, 0], orientation: "north", top: 18, range: 38, contour: true, cast: false, compare: false, evidence: false, overlay: false, truth: false, section: "off", cut: 0.5, follow: false, contact: "", camera: [], rulers: [], thresholds: {} };
 const REST_MS = 160;
+// So long must the circle be left alone before views that nobody asked for yet are decoded.
+const IDLE_MS = 1000;
+// Decoded of a view beyond what the circle shows: so much of its radius, for a picture that is moved a little.
+const MARGIN = 0.12;
 const RAD = Math.PI / 180;
 // A ruler's error in length is 1 / cos of its angle to the ray from the sonar: 1.5 % at this one.
 const ALONG_DEG = 10;
@@ -33,7 +37,7 @@ class App {
     this.casts = new Map();
     this.stats = { drawn: 0, events: [], latency: [], surfaces: [], first: 0 };
     const startWorker = () => new Worker(this.workerAddress(content?.files));
-    this.loader = new Loader(content?.files, startWorker, () => this.dirty());
+    this.loader = new Loader(content?.files, startWorker, (address) => { if (this.awaits(address)) this.dirty(); }, (address) => this.partOf(address));
     this.panels = [new Panel($("panel-a"), this, this.state.layers[0], "Left"), new Panel($("panel-b"), this, this.state.layers[1], "Right")];
     this.desk = new Desk(this);
     this.startSurfaces(startWorker());
@@ -140,6 +144,7 @@ class App {
     $("title").textContent = scene.title || "CSAS shadows";
     this.badge();
     $("follow-row").hidden = !scene.live;
+    document.body.classList.toggle("live", !!scene.live);
     for (const name of ["track", "target", "volumes", "dimensions", "pictures", "damage", "reduced", "contacts", "report", "other", "desk", "meshes"]) this.part(name);
     this.refetch();
     this.dirty();
@@ -270,11 +275,13 @@ class App {
   get guide() { return ["shadow", "sub_aperture", "likelihood", "shadow_mask"].find((n) => this.views(n).length) ?? "shadow"; }
 
   nearestOf(views, aspect = this.state.aspect) {
+    if (views.near?.aspect === aspect) return views.near.best;
     let best = -1, least = 1e9;
     views.forEach((v, i) => {
       const off = Math.abs(((((v.aspect_deg - aspect + 540) % 360) + 360) % 360) - 180);
       if (off < least) [least, best] = [off, i];
     });
+    views.near = { aspect, best };
     return best;
   }
 
@@ -322,7 +329,50 @@ class App {
           if (v) wanted.push(this.address(p.layer, v, "jpg"));
         }
       }
-    this.loader.want([...new Set(wanted)]);
+    this.loader.want([...new Set(wanted)], this.idle() ? this.others() : []);
+  }
+
+  // All views of both pictures, the nearest to the cursor last.
+  others() {
+    const each = this.panels.filter((p) => p.isView).map((p) => {
+      const views = this.views(p.layer), at = this.nearest(p.layer), n = views.length, order = [];
+      for (let i = n >> 1; i >= 1; i--) order.push(views[(at + i) % n], views[(at - i + n) % n]);
+      return order.map((v) => this.address(p.layer, v, "jpg"));
+    });
+    const longest = Math.max(0, ...each.map((l) => l.length)), mixed = [];
+    for (let i = 0; i < longest; i++) for (const l of each) if (i >= longest - l.length) mixed.push(l[i - longest + l.length]);
+    return mixed;
+  }
+
+  // Nothing is under way that this machine is needed for.
+  idle() {
+    const state = this.scene.progress?.state;
+    if (this.playing || state === "running" || state === "loading" || document.hidden || !this.loader.filled) return false;
+    const left = IDLE_MS - (performance.now() - (this.moved ?? 0));
+    clearTimeout(this.idling);
+    if (left > 0) this.idling = setTimeout(() => this.prefetch(), left + 20);
+    return left <= 0;
+  }
+
+  // Whether a drawing lacks what was just decoded; an outline tells nothing.
+  awaits(address) {
+    return !address || !/^api\/view\/.*jpg$/.test(address) || this.panels.some((p) => !p.found?.bitmap || p.found.wanted === address && !p.found.exact || p.found.late || p.sixWanted?.includes(address) && p.six);
+  }
+
+  // Of a view's quick picture: the square round the circle, and what is decoded of it, as (x, y, width, height)
+  // in whole pixels.
+  partOf(address) {
+    const [, kind, set, stamp, file] = address.split("/");
+    const view = kind === "view" && file.endsWith(".jpg") && this.sameStamp(set, { stamp });
+    if (!view) return undefined;
+    const { A } = view, other = isOther(set) ? this.offset : [0, 0], x = this.state.centre[0] - other[0], y = this.state.centre[1] - other[1];
+    const u = A[0] * x + A[1] * y + A[2], v = A[3] * x + A[4] * y + A[5], m = this.sceneRadius / this.state.zoom;
+    const ru = m * Math.hypot(A[0], A[1]), rv = m * Math.hypot(A[3], A[4]);
+    const square = (by, more) => {
+      const x0 = Math.min(view.cols - 1, Math.max(0, Math.floor(u - by * ru) - more)), y0 = Math.min(view.rows - 1, Math.max(0, Math.floor(v - by * rv) - more));
+      return [x0, y0, Math.min(view.cols, Math.max(1, Math.ceil(u + by * ru) + 1 + more)) - x0, Math.min(view.rows, Math.max(1, Math.ceil(v + by * rv) + 1 + more)) - y0];
+    };
+    return { shown: square(1, 1), decoded: square(1 + MARGIN, 2) };
   }
 
   async wantReduced() {
@@ -404,7 +454,7 @@ class App {
     }
     this.say();
     const shown = this.panels.map((p) => p.found?.about?.stamp ?? "").join();
-    const all = this.panels.every((p) => p.found?.bitmap), late = this.panels.some((p) => p.found?.late);
+    const all = this.panels.every((p) => p.found?.bitmap), late = this.panels.some((p) => p.found?.late || p.found?.partly);
     if (all && !this.stats.first) { this.stats.first = performance.now(); setTimeout(() => this.startSolid(), 50); }
     if (shown !== this.stats.shown && all) { this.stats.drawn++; this.stats.shown = shown; }
     if (this.stats.pending !== undefined && all && !late) {
@@ -484,7 +534,7 @@ class App {
     if (ruler) {
       const m = this.measured(ruler);
       text = m.height === undefined ? `${m.distance.toFixed(2)} m; no height: ${m.why}`
-        : `${m.distance.toFixed(2)} m; shadow L = ${m.L.toFixed(2)} m → h = L · tan ψ = ${m.L.toFixed(2)} m × tan ${m.psi.toFixed(1)}° = ${m.height.toFixed(2)} m (ψ: grazing angle at the shadow's tip)`;
+        : `${m.distance.toFixed(2)} m; shadow L = ${m.L.toFixed(2)} m → h = L · tan ψ = ${m.L.toFixed(2)} m × tan ${m.psi.toFixed(1)}° = ${m.height.toFixed(2)} m (ψ at the shadow's tip)`;
     } else if (this.state.ruling) text = "Ruler: drag along a shadow, away from the sonar.";
     else text = this.panels[1].slider.told(this.current?.aspect_deg);
     if ($("measured").textContent !== text) $("measured").textContent = text;
@@ -635,13 +685,23 @@ class App {
     $("truth-row").hidden = this.truthRev === undefined;
   }
 
+  // A heading counts from the scene's x-axis; who reads the circle wants a true bearing. An object has no
+  // front: 0° to 180°.
+  withAxis(d) {
+    if (!Number.isFinite(d?.heading_rad)) return d;
+    const bears = (rad) => 90 + this.north - rad / RAD, [low, high] = d.intervals?.heading_rad ?? [];
+    const axis = ((bears(d.heading_rad) % 180) + 180) % 180, intervals = { ...d.intervals, ...(Number.isFinite(low) && Number.isFinite(high) ? { axis: [bears(high), bears(low)] } : {}) };
+    return { ...d, axis, intervals };
+  }
+
   // Of the chosen contact: what was measured, with the truth, the surface at the threshold, and a second run.
   dimensions() {
     const c = this.contact, target = !c || c.volume === "main";
-    const d = target ? this.scene.dimensions ?? c?.dimensions : c.dimensions;
+    const d = this.withAxis(target ? this.scene.dimensions ?? c?.dimensions : c.dimensions);
     // Beside a second run there is room for nothing else.
-    const o = this.mate, t = o ? null : target ? this.scene.truth : c.truth, m = target && !o ? this.surfaceMeasures : null, table = $("dimensions");
+    const o = this.withAxis(this.mate), t = o ? null : this.withAxis(target ? this.scene.truth : c.truth), m = target && !o ? this.surfaceMeasures : null, table = $("dimensions");
     table.replaceChildren();
+    table.classList.toggle("pair", !!o);
     const row = (cells, head) => {
       const tr = table.insertRow();
       cells.forEach((cell, i) => {
@@ -654,19 +714,19 @@ class App {
     if (!d && !m) return void row(["", c?.reason ?? (this.scene.volumes.main ? "carved; not measured yet" : this.scene.status || "nothing carved yet")]);
     row(["", "found, 95 %", ...(t ? ["truth"] : []), ...(m?.object ? ["surface here"] : []), ...(o ? ["run B", "B − A"] : [])], true);
     const deg = 1 / RAD, half = (one, key) => (one?.intervals?.[key] ? (one.intervals[key][1] - one.intervals[key][0]) / 2 : undefined);
-    const told = (v, i, digits, unit) => (v === undefined || v === null ? "—" : `${v.toFixed(digits)}${i === undefined ? "" : ` ± ${i.toFixed(digits)}`} ${unit}`);
-    const names = [["length_m", "Length", "m", 2, 1], ["width_m", "Width", "m", 2, 1], ["height_m", "Height", "m", 2, 1], ["volume_m3", "Volume", "m³", 3, 1], ["heading_rad", "Heading", "°", 1, deg]];
+    const told = (v, i, digits, unit) => (v === undefined || v === null ? "—" : `${v.toFixed(digits).padStart(unit === "°" ? 5 : 0, "0")}${i === undefined ? "" : ` ± ${i.toFixed(digits)}`} ${unit}`);
+    const names = [["length_m", "Length", "m", 2, 1], ["width_m", "Width", "m", 2, 1], ["height_m", "Height", "m", 2, 1], ["volume_m3", "Volume", "m³", 3, 1], ["axis", "Axis bears", "°", 1, 1]];
     for (const [key, label, unit, digits, by] of names) {
       const v = d?.[key], i = half(d, key);
       if (v === undefined && !m?.object) continue;
-      if (key === "heading_rad" && v === undefined) continue;
+      if (key === "axis" && v === undefined) continue;
       const cells = [label, told(v === undefined || v === null ? v : v * by, i === undefined ? i : i * by, digits, unit)];
       if (t) cells.push(t[key] === undefined || t[key] === null ? "" : told(t[key] * by, undefined, digits, unit));
       if (m?.object) cells.push(m[key] === undefined ? "" : told(m[key], undefined, digits, unit));
       if (o) {
         cells.push(told(o[key] === undefined ? undefined : o[key] * by, half(o, key) === undefined ? undefined : half(o, key) * by, digits, unit));
         let off = (o[key] ?? NaN) - v;
-        if (key === "heading_rad") off = Math.atan2(Math.sin(2 * off), Math.cos(2 * off)) / 2; // an object has no front
+        if (key === "axis") off = ((off + 270) % 180) - 90;
         // Two independent 95 % intervals: theirs of the difference.
         const both = i === undefined || half(o, key) === undefined ? undefined : Math.hypot(i, half(o, key));
         cells.push(Number.isFinite(off) ? [`${off > 0 ? "+" : ""}${(off * by).toFixed(digits)} ${unit}`, both !== undefined && Math.abs(off) > both ? "differs" : "agrees"] : "—");

@@ -1,22 +1,32 @@
-// Compressed views in memory, few of them decoded: those round the cursor and where it is heading.
-const DECODED = 24, DECODES = 2, FETCHES = 4;
+// Compressed views in memory. Of each, the part that the circle shows is decoded: first round the cursor and
+// where it is heading, then, while nobody turns it, of all the others that there is room for.
+const ROOM_BYTES = 300e6, DECODES = 2, FETCHES = 4;
+// Decoded to the byte that the levels take, or to the four of colours.
+const bytesOf = ({ codes, width, height }) => codes?.length ?? 4 * width * height;
+const covers = (bitmap, part) => !bitmap.part || (!!part && bitmap.part[0] <= part[0] && bitmap.part[1] <= part[1] && bitmap.part[0] + bitmap.part[2] >= part[0] + part[2] && bitmap.part[1] + bitmap.part[3] >= part[1] + part[3]);
 
 const COLOURS = /\/(likelihood|color_by_aspect)\//;
+const isView = (address) => address.startsWith("api/view/") && address.endsWith(".jpg");
 const isOutline = (address) => address.startsWith("api/contour/");
 
 export class Loader {
-  constructor(files, startWorker, changed) {
+  // partOf: which part of a picture is shown, and with a margin round it; undefined: all of it.
+  constructor(files, startWorker, changed, partOf) {
     this.files = files; // of a page that was saved: address → data URL
     this.changed = changed;
+    this.partOf = partOf;
     this.decoders = Array.from({ length: DECODES }, startWorker);
     this.answers = new Map(); // address → what to do with its pixels
     for (const each of this.decoders) each.onmessage = ({ data }) => this.answers.get(data.id)(data);
     this.blobs = new Map(); // address → Blob
-    this.bitmaps = new Map(); // address → { width, height, codes } or ImageBitmap (colours), least recently used first
+    this.bitmaps = new Map(); // address → { width, height, codes, part } or ImageBitmap (colours), least recently used first
+    this.decoded = 0; // bytes of them
+    this.room = ROOM_BYTES;
     this.busy = new Map(); // address → "fetch" | "decode"
     this.failed = new Map(); // address → when
     this.awaited = new Set(); // outlines that a picture was drawn without
     this.wanted = []; // addresses to decode, the most wanted first
+    this.ahead = []; // addresses to decode while nothing is wanted, the nearest last
     this.all = []; // addresses to fetch sometime, coarse to fine
     this.outlines = new Map(); // address → closed lines
   }
@@ -35,9 +45,16 @@ export class Loader {
     return answer.blob();
   }
 
-  has(address) { return this.bitmaps.has(address); }
+  covered(address) {
+    const found = this.bitmaps.get(address);
+    return !!found && covers(found, this.partOf(address)?.shown);
+  }
 
-  bitmap(address) {
+  // A picture that covers what is shown of it.
+  bitmap(address) { return this.covered(address) ? this.whatever(address) : undefined; }
+
+  // The same, or what there is of it.
+  whatever(address) {
     const found = this.bitmaps.get(address);
     if (found) {
       this.bitmaps.delete(address);
@@ -46,15 +63,18 @@ export class Loader {
     return found;
   }
 
-  want(addresses) {
+  want(addresses, ahead) {
     this.wanted = addresses;
+    this.ahead = ahead;
     this.pump();
   }
 
   fetchAll(addresses) {
     this.all = addresses;
+    this.filling = true;
     const kept = new Set(addresses);
     for (const a of this.blobs.keys()) if (!kept.has(a) && !a.endsWith(".png")) this.blobs.delete(a);
+    for (const a of this.bitmaps.keys()) if (isView(a) && !kept.has(a) && !this.wanted.includes(a)) this.forget(a);
     for (const a of this.outlines.keys()) if (!kept.has(a)) this.outlines.delete(a);
     this.pump();
   }
@@ -63,7 +83,7 @@ export class Loader {
 
   pump() {
     for (const a of this.wanted) {
-      if (this.bitmaps.has(a) || this.busy.has(a)) continue;
+      if (this.busy.has(a) || this.covered(a)) continue;
       if (this.blobs.has(a)) {
         if (this.running("decode") < DECODES) this.decode(a);
       } else if (!this.paused && this.running("fetch") < FETCHES) this.fetch(a);
@@ -71,6 +91,13 @@ export class Loader {
     while (!this.paused && this.all.length && this.running("fetch") < FETCHES - 1) {
       const a = this.all.shift();
       if (!this.blobs.has(a) && !this.outlines.has(a) && !this.busy.has(a)) this.fetch(a);
+    }
+    while (this.ahead.length && this.running("decode") < DECODES) {
+      const a = this.ahead.pop(), part = this.partOf(a)?.decoded;
+      if (this.busy.has(a) || !this.blobs.has(a) || this.covered(a)) continue;
+      const bytes = part ? part[2] * part[3] : 0;
+      if (this.decoded + bytes > this.room) this.ahead = []; // none is thrown out for one that may never be seen
+      else this.decode(a);
     }
   }
 
@@ -93,17 +120,24 @@ export class Loader {
       setTimeout(() => this.pump(), 2100);
     }
     this.busy.delete(a);
+    if (this.filling && this.filled) {
+      this.filling = false;
+      this.changed(); // the page may decode ahead now
+    }
     this.pump();
   }
 
+  get filled() { return !this.all.length && !this.running("fetch"); }
+
   // Levels as bytes, by a thread of their own; colours as the browser decodes them.
   async pixels(a) {
-    if (COLOURS.test(a)) return createImageBitmap(this.blobs.get(a));
+    const blob = this.blobs.get(a), part = this.partOf(a)?.decoded;
+    if (COLOURS.test(a)) return Object.assign(await (part ? createImageBitmap(blob, ...part) : createImageBitmap(blob)), { part });
     const decoder = this.decoders.shift(); // no more are busy than there are
     this.decoders.push(decoder);
     const answer = await new Promise((done) => {
       this.answers.set(a, done);
-      decoder.postMessage({ do: "decode", id: a, blob: this.blobs.get(a) });
+      decoder.postMessage({ do: "decode", id: a, blob, part });
     });
     this.answers.delete(a);
     if (!answer.codes) throw new Error(`${a} is no picture`);
@@ -113,18 +147,28 @@ export class Loader {
   async decode(a) {
     this.busy.set(a, "decode");
     try {
-      this.bitmaps.set(a, await this.pixels(a));
-      while (this.bitmaps.size > 2 * DECODED) {
-        const [old, bitmap] = this.bitmaps.entries().next().value;
-        this.bitmaps.delete(old);
-        bitmap.close?.();
+      const made = await this.pixels(a);
+      this.forget(a);
+      this.bitmaps.set(a, made);
+      this.decoded += bytesOf(made);
+      for (const old of this.bitmaps.keys()) {
+        if (this.decoded <= this.room || old === a) break;
+        this.forget(old);
       }
-      this.changed();
+      this.changed(a);
     } catch {
       this.blobs.delete(a);
     }
     this.busy.delete(a);
     this.pump();
+  }
+
+  forget(a) {
+    const old = this.bitmaps.get(a);
+    if (!old) return;
+    this.bitmaps.delete(a);
+    this.decoded -= bytesOf(old);
+    old.close?.();
   }
 
   // A mask's outlines; undefined until they are there.

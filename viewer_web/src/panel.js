@@ -120,15 +120,13 @@ export class Panel {
     return { canvas: picture, side: picture.width, radius: this.radius * k, k: k * this.slider.em };
   }
 
+  // Degrees that the scene lies turned by, counter-clockwise: until true north is up, or the sonar.
+  turn(view) { return this.app.state.orientation === "sonar" && view ? 90 - view.aspect_deg : -this.app.north; }
+
   // Scene metres → canvas pixels, as (a, b, c, d, e, f) of x' = a x + c y + e, y' = b x + d y + f.
   ground(view, frame = this.frame) {
     const { state } = this.app, scale = (frame.radius / this.app.sceneRadius) * state.zoom, half = frame.side / 2;
-    let c = [scale, 0], r = [0, -scale]; // along x: (1, 0), along y: (0, -1)
-    if (state.orientation === "sonar" && view) {
-      const t = view.aspect_deg * RAD;
-      c = [scale * Math.sin(t), -scale * Math.cos(t)];
-      r = [-scale * Math.cos(t), -scale * Math.sin(t)];
-    }
+    const t = this.turn(view) * RAD, c = [scale * Math.cos(t), -scale * Math.sin(t)], r = [-scale * Math.sin(t), -scale * Math.cos(t)];
     const [x, y] = state.centre;
     return [c[0], r[0], c[1], r[1], half - c[0] * x - c[1] * y, half - r[0] * x - r[1] * y];
   }
@@ -221,14 +219,26 @@ export class Panel {
         const found = other && app.loader.bitmap(app.address(layer, other, "jpg"));
         if (found) return { about: other, view: other, wanted: quick, bitmap: found, late: true };
       }
-    return { about, view: about, wanted: quick, bitmap };
+    // Of a picture that was just zoomed out of, or moved: what there is of it, until the rest is decoded.
+    const part = bitmap ? undefined : app.loader.whatever(quick);
+    return { about, view: about, wanted: quick, bitmap: bitmap ?? part, partly: !!part };
   }
 
   draw() {
     if (!this.slider.side) return;
     this.found = this.find();
-    this.paint(this.frame);
+    if (this.slider.onPaper) this.print(this.frame);
+    else this.paint(this.frame);
     this.describe(this.found, this.found.view);
+  }
+
+  // A browser prints what is drawn on a canvas as lines and images, and none of the pixels that were put there;
+  // a circle that was cleared in the middle covers the picture with white. So both come as one image.
+  print(frame) {
+    const one = new OffscreenCanvas(frame.side, frame.side), { slider } = this;
+    this.paint({ ...frame, canvas: one });
+    if (!this.six) one.getContext("2d").drawImage(slider.ring, 0, 0);
+    slider.picture.getContext("2d", { alpha: false }).drawImage(one, 0, 0);
   }
 
   paint(frame) {
@@ -257,7 +267,7 @@ export class Panel {
       g.fillRect(0, 0, frame.side, frame.side);
       if (bitmap) {
         onto(about.A, other);
-        g.drawImage(bitmap, -0.5, -0.5);
+        g.drawImage(bitmap, (bitmap.part?.[0] ?? 0) - 0.5, (bitmap.part?.[1] ?? 0) - 0.5);
       }
       if (outline) {
         onto(outline.A, other);
@@ -320,7 +330,8 @@ export class Panel {
   }
 
   // Levels where the screen wants them, between their four neighbours, as greys. M: canvas → picture pixels.
-  levels(g, { codes, width, height }, [a, b, c, d, e, f], { radius, k }, outline) {
+  levels(g, { codes, width, height, part }, [a, b, left, d, e, top], { radius, k }, outline) {
+    const c = left - (part?.[0] ?? 0), f = top - (part?.[1] ?? 0);
     const side = g.canvas.width, half = side / 2, { grey } = this;
     this.screens ??= new Map();
     if (this.screens.size > 3) this.screens.clear();
@@ -421,7 +432,9 @@ export class Panel {
       const d = 5 * k;
       g.lineWidth = (chosen ? 2 : 1) * k; g.strokeStyle = chosen ? COLOURS.sonar : "#dfe7ec";
       g.beginPath(); g.moveTo(x - d, y); g.lineTo(x + d, y); g.moveTo(x, y - d); g.lineTo(x, y + d); g.stroke();
-      written(c.name.replace("Contact ", ""), x + 9 * k, y - 6 * k, chosen ? COLOURS.sonar : "#dfe7ec");
+      // Beside its cross, as far as the disc has room for it.
+      const name = c.name.replace("Contact ", ""), wide = g.measureText(name).width / 2 + 3 * k, chord = Math.sqrt(r * r - Math.min(r, Math.abs(y - 12 * k - half)) ** 2);
+      written(name, Math.max(half - chord + wide, Math.min(half + chord - wide, x + 9 * k)), y - 6 * k, chosen ? COLOURS.sonar : "#dfe7ec");
     }
     for (const ruler of app.rulersHere()) {
       const [a, b] = ruler.ends.map(at), told = app.measured(ruler);
@@ -477,15 +490,15 @@ export class Panel {
     const views = app.views(this.isView && app.views(name).length ? name : app.guide);
     const shown = found.view ? views.findIndex((v) => v.stamp === found.view.stamp) : -1;
     // Hue by aspect, as the picture has it.
-    const turn = app.state.orientation === "sonar" && view ? view.aspect_deg - 90 : 0;
-    this.slider.wheel = name === "color_by_aspect" ? turn : undefined;
+    const turn = this.turn(view);
+    this.slider.wheel = name === "color_by_aspect" ? -turn : undefined;
     if (this.slider.bare !== !!this.six) {
       this.slider.bare = !!this.six;
       for (const part of [this.slider.ring, this.slider.dot]) part.style.visibility = this.six ? "hidden" : "visible";
     }
     this.slider.turns = app.state.orientation === "sonar";
     const rings = !this.six && !isOther(name);
-    this.slider.turn = this.slider.turns && view ? 90 - view.aspect_deg : 0;
+    this.slider.turn = turn;
     this.slider.north = app.north;
     this.slider.evidence = rings ? app.evidence : undefined;
     this.slider.show(app.aspectsOf(views), app.stepOf(views), shown >= 0 ? shown : app.nearestOf(views));

@@ -27,7 +27,7 @@ export class CsasSlider extends HTMLElement {
     this.setAttribute("aria-label", this.getAttribute("label") ?? "Aspect");
     new ResizeObserver(() => this.resize()).observe(this);
     for (const [when, on] of [["beforeprint", true], ["afterprint", false]])
-      addEventListener(when, () => { this.onPaper = on; this.drawRing(); });
+      addEventListener(when, () => { this.onPaper = on; this.drawRing(); this.dispatchEvent(new CustomEvent("resized")); });
     this.addEventListener("pointerdown", (e) => {
       if (!this.onRing(e)) return;
       this.setPointerCapture(e.pointerId);

@@ -117,12 +117,12 @@ export function cast({ points, faces }, P, rows, cols) {
   return new Float32Array(lines);
 }
 
-// A picture of levels as its bytes: the page looks them up where the screen wants them, which costs a third of
+// A picture of levels, or a part (x, y, width, height) of it, as its bytes: the page looks them up where the screen wants them, which costs a third of
 // having the browser draw them and reading that back.
-async function decode({ id, blob }) {
+async function decode({ id, blob, part }) {
   try {
-    const { width, height, codes } = await ((self.ImageDecoder && (await decoded(blob))) || drawn(blob));
-    self.postMessage({ id, width, height, codes }, [codes.buffer]);
+    const { width, height, codes } = await ((self.ImageDecoder && (await decoded(blob, part))) || drawn(blob, part));
+    self.postMessage({ id, width, height, codes, part }, [codes.buffer]);
   } catch {
     self.postMessage({ id });
   }
@@ -137,16 +137,17 @@ const levels = (pixels) => {
 
 // By the browser's decoder alone, which takes half as long: it is there on this machine, and over https.
 let spare;
-async function decoded(blob) {
+async function decoded(blob, part) {
   const decoder = new ImageDecoder({ data: await blob.arrayBuffer(), type: blob.type });
   try {
     const { image } = await decoder.decode();
     try {
-      const { width, height } = image.visibleRect, bytes = image.allocationSize();
+      const { visibleRect } = image, [x, y, width, height] = part ?? [visibleRect.x, visibleRect.y, visibleRect.width, visibleRect.height];
+      const of = { rect: { x, y, width, height } }, bytes = image.allocationSize(of);
       if (!/^(RGB|BGR)[AX]$/.test(image.format)) return undefined;
       const pixels = spare?.byteLength === bytes ? spare : new ArrayBuffer(bytes); // of this picture alone, until it is done
       spare = undefined;
-      const [{ offset, stride }] = await image.copyTo(pixels);
+      const [{ offset, stride }] = await image.copyTo(pixels, of);
       if (offset || stride !== 4 * width || bytes !== stride * height) return undefined;
       const codes = levels(pixels);
       spare = pixels;
@@ -156,8 +157,8 @@ async function decoded(blob) {
 }
 
 let canvas, context;
-async function drawn(blob) {
-  const bitmap = await createImageBitmap(blob), { width, height } = bitmap;
+async function drawn(blob, part) {
+  const bitmap = await (part ? createImageBitmap(blob, ...part) : createImageBitmap(blob)), { width, height } = bitmap;
   if (canvas?.width !== width || canvas.height !== height) {
     canvas = new OffscreenCanvas(width, height);
     context = canvas.getContext("2d", { alpha: false, willReadFrequently: true });
