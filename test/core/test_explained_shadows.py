@@ -25,7 +25,7 @@ from csas_shadow_ros.core.shape.explained import cast_shadow, shadow_fit, unexpl
 from csas_shadow_ros.core.shape.layover import layover_per_metre
 from csas_shadow_ros.core.shape.result import Result, ViewEvidence
 from csas_shadow_ros.core.shape.verdict import explained_share, judge
-from csas_shadow_ros.core.shape.volume import Volume
+from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 from csas_shadow_ros.simulation import shadow_hull, simulate, voxelise_truth
 
 #: Six times as long as high: its shadow is half as long as its top.
@@ -138,7 +138,14 @@ def test_a_faint_top_behind_a_shadow_is_not_taken_for_lit_seabed():
     truth = box_voxels(*near, volume=volume)
     alone = carver.grid()
     behind = box_voxels(*far, volume=beyond)
-    other = replace(alone, volume=beyond, occupied=behind)
+    other = VoxelGrid(
+        beyond,
+        np.zeros(beyond.shape, np.float32),
+        np.full(beyond.shape, len(INFOS), np.uint16),
+        alone.threshold,
+        behind,
+        "consensus",
+    )
     assert iou(alone.occupied, truth) < 0.75, "or the scene shows nothing"
     beside = carver.beside(alone, [other])
     layers = truth.any(axis=(1, 2)).sum()
