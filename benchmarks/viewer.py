@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csas_shadow_ros.core.geometry import Acoustics, ShadowCamera, ViewInfo, view_ground_to_pixel
-from csas_shadow_ros.core.imaging.masks import MASK_SHADOW
+from csas_shadow_ros.core.imaging.mask_codes import MASK_SHADOW
 from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 from csas_shadow_ros.viewer import server as served
 from csas_shadow_ros.viewer.codes import amplitude_codes

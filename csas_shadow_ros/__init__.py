@@ -2,7 +2,7 @@
 
 What a program needs is here by name; `docs/python.md` shows it. A name is loaded when it is first used.
 
-That is lazy_loader's work, here alone. Inside the package, what is slow to import and seldom used
+That is lazy_loader's work, here and in `results`. Inside the package, what is slow to import and seldom used
 (scipy.signal: 1.9 s on two busy cores, ``python -c "import scipy.signal"``) is imported in the function
 that uses it, with a comment ("Late: …"). ``lazy_loader.load`` gives whole modules, untyped, so that mypy
 would check nothing of them, and loads the parent of a submodule at once; most late imports are of single

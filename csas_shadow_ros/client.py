@@ -24,7 +24,7 @@ from rclpy.signals import uninstall_signal_handlers
 
 from csas_shadow_ros.core.errors import CsasError, ParameterError
 from csas_shadow_ros.core.geometry import View, ViewInfo, looks_at
-from csas_shadow_ros.core.imaging.masks import MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
+from csas_shadow_ros.core.imaging.mask_codes import MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from msg_adapters import (
     VIEW_STREAMS,
     Heartbeat,

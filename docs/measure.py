@@ -37,7 +37,7 @@ from csas_shadow_ros.core.imaging import likelihood, segmentation
 from csas_shadow_ros.core.imaging.enhancement import enhance, focus_range
 from csas_shadow_ros.core.imaging.likelihood import Levels, box_mean
 from csas_shadow_ros.core.imaging.local_means import LocalMeans
-from csas_shadow_ros.core.imaging.masks import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
+from csas_shadow_ros.core.imaging.mask_codes import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from csas_shadow_ros.core.imaging.subaperture import Spectrum, SubApertures
 from csas_shadow_ros.core.parameters import (
     CarvingParameters,

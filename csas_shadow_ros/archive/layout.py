@@ -15,7 +15,7 @@ from typing import Any
 
 from ..core.errors import CsasError
 from ..durable import sync
-from ..results import looks_like_results
+from ..results.layout import looks_like_results
 
 FORMAT = "csas_shadow_ros archive 1"
 TASK_FORMAT = "csas_shadow_ros task 1"

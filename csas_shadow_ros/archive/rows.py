@@ -11,8 +11,7 @@ from typing import Any
 
 from ..core.errors import CsasError
 from ..core.geometry import Datum
-from ..results import read_report
-from ..results.folder import REPORT
+from ..results.layout import REPORT, read_report
 from .layout import COPY, DONE, FAILED_STATUS, PartOfTask, Record, brief
 
 #: Columns of the run's table, and what kind of value each holds.

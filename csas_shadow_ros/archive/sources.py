@@ -12,7 +12,7 @@ from pathlib import Path
 from ..bags.metadata import METADATA
 from ..core.errors import BagError, ParameterError
 from ..durable import sha256
-from ..results import looks_like_results
+from ..results.layout import looks_like_results
 from .layout import ARCHIVE
 
 _STORED = (".mcap", ".db3")

@@ -126,7 +126,7 @@ def _catalogue(arguments: argparse.Namespace, console: Console) -> int:
 
 def _find(arguments: argparse.Namespace, console: Console) -> int:
     from ..archive.command import find
-    from ..results.report import json_ready
+    from ..results.layout import json_ready
 
     rows, text = find(arguments)
     console.result(text, json_ready(rows))

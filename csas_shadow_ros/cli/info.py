@@ -35,7 +35,7 @@ def _info(arguments: argparse.Namespace, console: Console) -> int:
         return OK
     from ..bags import read_run
     from ..results import read_truth
-    from ..results.report import json_ready
+    from ..results.layout import json_ready
     from ..run_bag import describe_run, stages_of, topic_sizes
 
     run = read_run(arguments.path, arguments.namespace)

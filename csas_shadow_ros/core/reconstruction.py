@@ -23,7 +23,8 @@ from .geometry import SCENE_FRAME, View, ViewInfo
 from .geometry.arcs import Arc, Arcs
 from .imaging.composites import Composites
 from .imaging.likelihood import Levels
-from .imaging.masks import MASK_SHADOW, KeptMask
+from .imaging.mask_codes import MASK_SHADOW
+from .imaging.masks import KeptMask
 from .imaging.segmentation import require_silhouette
 from .parameters import PipelineParameters
 from .search.decision import Decision

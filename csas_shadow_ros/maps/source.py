@@ -26,8 +26,8 @@ from ..core.parameters import PlaceParameters
 from ..core.shape.mesh import Dimensions
 from ..core.shape.result import Quality, Result
 from ..core.shape.volume import Volume, VoxelGrid
-from ..results import read_report
 from ..results.bag import ResultBag
+from ..results.layout import read_report
 
 #: What a mask says of a pixel in the target's shadow (docs/conventions.md).
 _SHADOW = 255

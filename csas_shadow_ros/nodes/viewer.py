@@ -24,11 +24,12 @@ from rclpy.duration import Duration
 from csas_shadow_ros.bags.bag import BagMessage
 from csas_shadow_ros.core.errors import CsasError
 from csas_shadow_ros.core.parameters import CarvingParameters, SubApertureParameters
-from csas_shadow_ros.results.report import json_ready
+from csas_shadow_ros.results.layout import json_ready
 from csas_shadow_ros.viewer.codes import amplitude_codes
 from csas_shadow_ros.viewer.contacts import about, contacts_of
+from csas_shadow_ros.viewer.derived import Reduced, Shape
 from csas_shadow_ros.viewer.server import ViewerServer
-from csas_shadow_ros.viewer.source import Reduced, Shape, box_json, grid_of, spooled
+from csas_shadow_ros.viewer.source import box_json, grid_of, spooled
 from csas_shadow_ros.viewer.store import Spool, ViewStore
 from msg_adapters import (
     TOPICS,

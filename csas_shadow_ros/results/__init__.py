@@ -1,23 +1,8 @@
-"""Results folders: grid, meshes, report, bag and figures of a run, and its score against a truth."""
+"""Results folders: grid, meshes, report, bag and figures of a run, and its score against a truth.
 
-from .check import ResultsCheck, check_results, looks_like_results
-from .folder import ResultsError, ResultsWriter, is_results_folder, read_report
-from .report import Context, build_report, summary
-from .truth import KnownTruth, TruthError, read_truth, score
+A name is loaded when it is first used, as in the package: who reads a report needs no chain.
+"""
 
-__all__ = [
-    "Context",
-    "KnownTruth",
-    "ResultsCheck",
-    "ResultsError",
-    "ResultsWriter",
-    "TruthError",
-    "build_report",
-    "check_results",
-    "is_results_folder",
-    "looks_like_results",
-    "read_report",
-    "read_truth",
-    "score",
-    "summary",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -13,8 +13,7 @@ from typing import Any
 
 from .. import __version__
 from ..durable import BY_HAND, CHECKSUMS, sha256
-from .folder import GRID, REPORT
-from .report import FORMAT
+from .layout import FORMAT, REPORT
 
 #: Larger ones are not of this package: a report of 10 000 views has 5 MB.
 _MOST_BYTES = 256_000_000
@@ -76,14 +75,6 @@ class ResultsCheck:
         head = f"{self.path}: {'whole' if self.ok else 'not as it was written'}"
         by = f" by csas-shadow {self.version}" if self.version else ""
         return "\n".join([head, f"  {self.files} files as written{by}", *map(str, self.findings)])
-
-
-def looks_like_results(path: str | Path) -> bool:
-    """Say whether a path is a results folder, if only a damaged one, rather than a bag."""
-    folder = Path(path)
-    if not folder.is_dir() or (folder / "metadata.yaml").exists():
-        return False
-    return any((folder / name).exists() for name in (REPORT, CHECKSUMS, GRID))
 
 
 def _check_report(base: Path, check: ResultsCheck, error: Callable[..., None]) -> set[str]:

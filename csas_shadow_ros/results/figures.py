@@ -32,7 +32,7 @@ from ..core.geometry import (
     unit_to_sonar,
 )
 from ..core.imaging.enhancement import enhance
-from ..core.imaging.masks import MASK_COVERED, MASK_SHADOW, MASK_UNKNOWN
+from ..core.imaging.mask_codes import MASK_COVERED, MASK_SHADOW, MASK_UNKNOWN
 from ..core.imaging.subaperture import Spectrum, SubApertures
 from ..core.methods import method_named
 from ..core.pipeline import ProcessedView

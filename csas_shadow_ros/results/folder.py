@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import time
 from collections.abc import Callable
@@ -23,7 +22,8 @@ from ..core.shape.result import Result
 from ..core.shape.volume import Volume, VoxelGrid
 from ..durable import BY_HAND, CHECKSUMS, Place, write_checksums
 from .bag import ResultBag
-from .report import FORMAT, Context, build_report, complete_report, report_text, summary
+from .layout import GRID, REPORT, SUMMARY, ResultsError, is_results_folder
+from .report import Context, build_report, complete_report, report_text, summary
 from .subject import Keeper, Subject
 from .truth import KnownTruth, of_nothing, of_objects, placed, score
 
@@ -32,9 +32,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-REPORT = "report.json"
-SUMMARY = "summary.txt"
-GRID = "grid.npz"
 #: The surface of the matter alone, where echoes show a hollow.
 MATTER_MESH = "mesh_matter.stl"
 MESH_FORMATS = ("stl", "ply", "obj", "glb")
@@ -47,10 +44,6 @@ _STREAMS = {
 }
 #: Voxels a side of the grid that says that nothing is known, where there is no target.
 _EMPTY_SIDE = 32
-
-
-class ResultsError(CsasError):
-    """A results folder cannot be written or read."""
 
 
 class ResultsWriter:
@@ -407,25 +400,3 @@ def _write_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
         path.write_text(data, encoding="utf-8")
     else:
         path.write_bytes(data)
-
-
-def is_results_folder(folder: str | Path) -> bool:
-    """Say whether a folder holds results."""
-    try:
-        return bool(json.loads((Path(folder) / REPORT).read_text(encoding="utf-8")).get("format") == FORMAT)
-    except (OSError, ValueError, AttributeError):
-        return False
-
-
-def read_report(folder: str | Path) -> dict[str, Any]:
-    """Read the report of a results folder.
-
-    Raises
-    ------
-    ResultsError
-        If it is none.
-    """
-    if not is_results_folder(folder):
-        raise ResultsError(f"{folder} is not a results folder: it holds no {REPORT} of this package")
-    report: dict[str, Any] = json.loads((Path(folder) / REPORT).read_text(encoding="utf-8"))
-    return report

@@ -26,9 +26,8 @@ from ..core.shape.result import Result, ViewEvidence
 from ..core.shape.threshold import thresholded
 from ..core.shape.verdict import explained_share, no_object_reason
 from ..core.shape.volume import VoxelGrid
+from .layout import FORMAT, json_ready
 from .truth import KnownTruth, TruthError, read_truth
-
-FORMAT = "csas_shadow_ros results 1"
 
 
 @dataclass(eq=False)
@@ -93,25 +92,6 @@ class Context:
             self.input = make()
         except Exception as error:  # the bag may be gone by now, or no longer what it was
             self.failed["input"] = f"cannot be described: {type(error).__name__}: {error}"
-
-
-def json_ready(value: Any) -> Any:
-    """Return a value as JSON has it: NaN and infinities become null, arrays lists."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return json_ready(dataclasses.asdict(value))
-    if isinstance(value, Mapping):
-        return {str(k): json_ready(v) for k, v in value.items()}
-    if isinstance(value, list | tuple | set):
-        return [json_ready(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return json_ready(value.tolist())
-    if isinstance(value, np.generic):
-        return json_ready(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if value is None or isinstance(value, str | int | float):
-        return value
-    return str(value)  # dates, paths and what else a bag's metadata may hold
 
 
 @functools.cache  # a third of a second

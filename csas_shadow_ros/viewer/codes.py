@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ..core.errors import ViewError
-from ..core.imaging.masks import MASK_SHADOW
+from ..core.imaging.mask_codes import MASK_SHADOW
 
 #: Amplitudes: code 1 is so many dB over the view's median (the seabed's level), each further code a step.
 LOW_DB, STEP_DB = -32.0, 0.25

@@ -26,7 +26,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from .. import __version__
-from ..core.imaging.masks import MASK_SHADOW
+from ..core.imaging.mask_codes import MASK_SHADOW
 from ..core.shape.mesh import mesh_from_grid
 from .contacts import axis_bearing_deg
 from .crop import HIGH_SHOWN_DB as _HIGH

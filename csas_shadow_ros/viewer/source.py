@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-import math
 import threading
 import zlib
 from collections.abc import Callable, Iterator
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from msg_adapters.camera_info import view_info_from_msg
@@ -28,22 +26,17 @@ from ..bags import BagReader, iterate_pairs, read_run
 from ..bags.index import BagIndex
 from ..bags.pairs import checked_messages
 from ..core.errors import BagError, CsasError
-from ..core.geometry import CoherentImage, Track, View
-from ..core.imaging.subaperture import SubApertures
-from ..core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
-from ..core.pipeline import ProcessedView
-from ..core.reconstruction import Reconstruction
-from ..core.search.decision import Decision
+from ..core.geometry import View
+from ..core.parameters import CarvingParameters, PipelineParameters
 from ..core.shape.threshold import thresholded
-from ..core.shape.volume import Target, Volume, VoxelGrid
+from ..core.shape.volume import Volume, VoxelGrid
+from ..results.layout import looks_like_results, read_report
 from . import codes
 from .contacts import about, contacts_of
 from .desk import Desk
 from .store import Entry, Spool, ViewerError, ViewStore
 
 log = logging.getLogger(__name__)
-#: Width of the reduced sub-apertures of figure 5 (deg).
-REDUCED_DEG = 4.0
 RESULT_BAG = "result.mcap"
 #: So many faults are told one by one on the page.
 _TOLD = 6
@@ -62,101 +55,6 @@ def spooled(spool: Spool, name: str, view: View) -> Entry:
     """Make the entry of a view that came by; its codes are kept on disk."""
     pixels = codes_of(name, view.pixels)
     return Entry(view.info, f"{zlib.crc32(pixels.tobytes()):08x}", spool.put(pixels))
-
-
-class Reduced:
-    """Sub-apertures of 4°, made when they are looked at (figure 5a)."""
-
-    def __init__(self, image: CoherentImage, track: Track, p: SubApertureParameters) -> None:
-        self._image, self._track = image, track
-        self._p = replace(p, aperture_deg=min(REDUCED_DEG, p.aperture_deg), spacing_m=0.0)
-        # Browsers keep what an address gave: another run, with the same stamps, is to have others.
-        sample = np.ascontiguousarray(image.pixels[::16, ::16])
-        self._revision = f"{zlib.crc32(sample.tobytes()):08x}_{self._p.aperture_deg:g}"
-
-    def fill(self, store: ViewStore) -> None:
-        """Add one to the store for each sub-aperture view, or shadow view, that is there."""
-        made = SubApertures(self._image, self._track, self._p)
-        for one in list((store.sets["sub_aperture"] or store.sets["shadow"]).values()):
-            aspect = one.info.aspect_rad
-            try:
-                info = made.info(aspect)
-            except CsasError as error:
-                log.info("no reduced view at %.1f deg: %s", math.degrees(aspect), error)
-                continue
-
-            def load(aspect: float = aspect) -> NDArray[np.uint8]:
-                return codes.amplitude_codes(made.view_of_aspect(aspect).pixels)
-
-            # The stamp of the view that it is compared with, to the nanosecond.
-            entry = Entry(replace(info, stamp_ns=one.info.stamp_ns), self._revision, load)
-            store.put_view("reduced", entry)
-
-
-class Shape:
-    """The other method's grid, and dimensions where nobody has published them, as views come in."""
-
-    def __init__(self, store: ViewStore, parameters: CarvingParameters) -> None:
-        self._store = store
-        self.parameters = parameters
-        self._taken: set[tuple[str, int]] = set()
-        self._volume: Volume | None = None
-        self._made: Reconstruction | None = None
-
-    @property
-    def other_stream(self) -> str:
-        """Which stream the other method takes."""
-        return "shadow_mask" if self.parameters.other().takes_masks else "likelihood"
-
-    def pending(self) -> list[tuple[str, Entry]]:
-        """Return the likelihoods and masks in the store that have not been taken yet."""
-        main = self._store.grids.get("main")
-        if main is None:
-            return []
-        self._on(main.volume)
-        with self._store.lock:
-            return [
-                (name, entry)
-                for name in dict.fromkeys((self.other_stream, "shadow_mask"))
-                for entry in self._store.sets[name].values()
-                if (name, entry.info.stamp_ns) not in self._taken
-            ]
-
-    def _on(self, volume: Volume) -> Reconstruction:
-        if self._made is None or self._volume != volume:
-            x, y, _ = volume.centre_m
-            carving = replace(self.parameters, voxel_size_m=volume.voxel_size_m)
-            decision = Decision(Target((x, y), volume.size_m))
-            self._made = Reconstruction(decision, PipelineParameters(carving=carving), compose=False)
-            self._volume, self._taken = volume, set()
-        return self._made
-
-    def add(self, name: str, entry: Entry) -> None:
-        """Take one likelihood or mask."""
-        main = self._store.grids.get("main")
-        if main is None:
-            return
-        made = self._on(main.volume)
-        self._taken.add((name, entry.info.stamp_ns))
-        pixels: NDArray[Any] = entry.load()
-        if name == "likelihood":
-            pixels = codes.likelihood_of(pixels)
-        view = View(entry.info, pixels)
-        try:
-            one = ProcessedView(made.decision.target, made.parameters, **{name: view})
-            made.add(one, parts=(name.removeprefix("shadow_"),))
-        except CsasError as error:
-            log.info("%s: %s", name, error)  # the node that made it, or the report, names it too
-
-    def publish(self, *, measure: bool) -> None:
-        """Give the store what there is now."""
-        if self._made is None:
-            return
-        other = self._made.bodies[0].other
-        if other is not None and other.stamps:
-            self._store.put_grid("other", other.grid(), self.parameters.min_views_fraction)
-        if measure and self._made.stamps:
-            self._store.put_dimensions(self._made.result().dimensions)
 
 
 def grid_of(
@@ -218,9 +116,6 @@ class PathSource:
     """
 
     def __init__(self, store: ViewStore, path: str | Path, namespace: str | None = None) -> None:
-        from ..results.check import looks_like_results
-        from ..results.folder import read_report
-
         self.store = store
         path = Path(path)
         store.title = path.resolve().name
@@ -367,11 +262,15 @@ class PathSource:
         path = Path(str(truth.get("mesh", ""))) if isinstance(truth, dict) else Path()
         if path.suffix != ".stl" or not path.is_file():  # it lies beside the bag, which may be elsewhere
             return
+        import trimesh  # late: takes half a second, and the first picture waits for this module
+
         mesh = trimesh.load_mesh(path)
         if len(mesh.faces) <= _MOST_FACES:
             self.store.put_mesh("truth", mesh)
 
     def _make_reduced(self) -> None:
+        from .derived import Reduced  # late: compiles kernels
+
         run = read_run(self._bag, self._reader.namespace)
         Reduced(run.coherent_image(), run.require_track(), self.parameters.sub_aperture).fill(self.store)
 
@@ -402,6 +301,8 @@ class PathSource:
                     pass
 
     def _shape(self) -> None:
+        from .derived import Shape  # late: compiles kernels; the first picture is there by now
+
         shape = Shape(self.store, replace(self.parameters.carving, threshold=0.0))
         measure = not self._report and not self._measured()
         for name in ("likelihood", "shadow_mask"):
@@ -454,4 +355,4 @@ class PathSource:
                 self.store.put_picture(name, info, shown)
 
 
-__all__ = ["PathSource", "Reduced", "Shape", "codes_of", "grid_of", "spooled"]
+__all__ = ["PathSource", "codes_of", "grid_of", "spooled"]

@@ -12,10 +12,9 @@ import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from msg_adapters.camera_info import GroundInfo
@@ -27,6 +26,9 @@ from ..core.shape.threshold import needed_threshold, well_seen_voxels
 from ..core.shape.volume import VoxelGrid
 from . import codes
 from .codes import LOW_DB, STEP_DB, Codes
+
+if TYPE_CHECKING:
+    import trimesh
 
 #: Sets of views, and how they are shown.
 SETS = {
@@ -279,7 +281,7 @@ class ViewStore:
     def put_dimensions(self, found: Dimensions | Mapping[str, Any] | None) -> None:
         """Set the dimensions with their 95 % intervals."""
         if isinstance(found, Dimensions):
-            from ..results.report import json_ready
+            from ..results.layout import json_ready
 
             found = json_ready(found)
         self.put_part("dimensions", found)

@@ -11,13 +11,8 @@ import trimesh
 from core_data import ground_of_pixels, hidden_by_box, iou, make_info
 
 from csas_shadow_ros.core.geometry import View
-from csas_shadow_ros.core.imaging.masks import (
-    MASK_COVERED,
-    MASK_OUTSIDE,
-    MASK_SHADOW,
-    MASK_UNKNOWN,
-    near_covered,
-)
+from csas_shadow_ros.core.imaging.mask_codes import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
+from csas_shadow_ros.core.imaging.masks import near_covered
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.pipeline import run
 from csas_shadow_ros.core.shape.carving import Carver, carve

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from csas_shadow_ros.core.geometry import Track, View, down_range_axis
-from csas_shadow_ros.core.imaging.masks import MASK_SHADOW, MASK_UNKNOWN
+from csas_shadow_ros.core.imaging.mask_codes import MASK_SHADOW, MASK_UNKNOWN
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.pipeline import run
 from csas_shadow_ros.core.shape.carving import Carver

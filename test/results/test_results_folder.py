@@ -26,7 +26,7 @@ from csas_shadow_ros.results import Context, ResultsError, ResultsWriter, check_
 from csas_shadow_ros.results import figures as figures_module
 from csas_shadow_ros.results import folder as folder_module
 from csas_shadow_ros.results.bag import ResultBag
-from csas_shadow_ros.results.report import json_ready
+from csas_shadow_ros.results.layout import json_ready
 
 ROOT = Path(csas_shadow_ros.__file__).resolve().parents[1]
 #: No process has it: the largest number that Linux gives is 2**22.

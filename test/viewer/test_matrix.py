@@ -25,7 +25,7 @@ from browser import Watched
 from test_found import cursor, get, luminance
 
 from csas_shadow_ros.cli import main
-from csas_shadow_ros.core.imaging.masks import MASK_SHADOW
+from csas_shadow_ros.core.imaging.mask_codes import MASK_SHADOW
 from csas_shadow_ros.viewer.compare import Second
 from csas_shadow_ros.viewer.contact_report import sheet_of, view_of_shadow
 from csas_shadow_ros.viewer.crop import contact_named, shadow_m

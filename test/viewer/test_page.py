@@ -17,7 +17,7 @@ import trimesh
 from synthetic import COUNT, PIXELS, code_of, entry
 
 from csas_shadow_ros.cli import main
-from csas_shadow_ros.core.imaging.masks import MASK_SHADOW
+from csas_shadow_ros.core.imaging.mask_codes import MASK_SHADOW
 from csas_shadow_ros.core.shape.mesh import mesh_from_grid
 from csas_shadow_ros.viewer.export import export_html
 from csas_shadow_ros.viewer.server import ViewerServer

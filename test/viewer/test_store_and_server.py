@@ -25,8 +25,9 @@ from csas_shadow_ros.core.parameters import SubApertureParameters
 from csas_shadow_ros.core.shape.mesh import mesh_from_grid
 from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 from csas_shadow_ros.viewer import codes
+from csas_shadow_ros.viewer.derived import Reduced
 from csas_shadow_ros.viewer.server import ViewerServer, is_loopback
-from csas_shadow_ros.viewer.source import PathSource, Reduced
+from csas_shadow_ros.viewer.source import PathSource
 from csas_shadow_ros.viewer.store import Spool, ViewerError, ViewStore
 
 

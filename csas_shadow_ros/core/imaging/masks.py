@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from ..geometry import View, ViewInfo
 from ..kernels import kernel
+from .mask_codes import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 
-#: Values of a shadow mask (mono8). Covered: lit, between an echo and the shadow behind it; either the
-#: target's own echo, laid over what it hides, or seabed that is seen under it.
-MASK_OUTSIDE, MASK_COVERED, MASK_UNKNOWN, MASK_SHADOW = 0, 64, 128, 255
 #: An echo speaks for so much on either side of it (resolution cells across): an edge that glitters has gaps.
 _BESIDE_CELLS = 0.75
 #: The flank of a shadow without an echo before it (resolution cells down-range).

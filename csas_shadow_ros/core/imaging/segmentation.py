@@ -19,7 +19,8 @@ from ..geometry import View, ViewInfo
 from ..kernels import kernel
 from ..parameters import LikelihoodParameters
 from .likelihood import Levels, view_levels
-from .masks import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, beside_px, flank_px
+from .mask_codes import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
+from .masks import beside_px, flank_px
 
 #: Shadow where the local mean power is less than this far from the shadow's level to the seabed's. At a
 #: straight edge half of the box lies on seabed and the mean is 0.5 of the way. Less than that, as beside a

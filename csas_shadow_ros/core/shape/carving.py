@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from ..errors import ParameterError, ViewError
 from ..geometry import View, ViewInfo
-from ..imaging.masks import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN, KeptMask
+from ..imaging.mask_codes import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
+from ..imaging.masks import KeptMask
 from ..kernels import kernel
 from ..methods import method_named
 from ..parameters import CarvingParameters

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry import View
-from ..imaging.masks import MASK_OUTSIDE, MASK_SHADOW
+from ..imaging.mask_codes import MASK_OUTSIDE, MASK_SHADOW
 from ..kernels import kernel
 from .volume import Volume, VoxelGrid
 

@@ -32,7 +32,7 @@ from scipy.optimize import nnls
 from ..geometry import TWO_PI, View, ViewInfo, cross_range_axis, down_range_axis
 from ..imaging.likelihood import Levels
 from ..imaging.local_means import LocalMeans
-from ..imaging.masks import MASK_SHADOW, MASK_UNKNOWN
+from ..imaging.mask_codes import MASK_SHADOW, MASK_UNKNOWN
 from .contour import Contour, contour_height, contour_of
 from .mesh import Dimensions, digits_of, measure
 from .seabed import largest_piece
