@@ -90,3 +90,26 @@ def test_no_more_is_decoded_ahead_than_there_is_room_for(watched: Any, serve: An
     watched.js("csas.setAspect(180)")
     watched.settle()
     assert watched.js("csas.loader.decoded") <= 200000
+
+
+def test_asking_whether_the_circle_is_left_alone_keeps_nothing_from_being_decoded(
+    watched: Any, serve: Any
+) -> None:
+    watched.open(serve(store_of_slopes()))
+    alone(watched)
+    watched.js(
+        "(() => { for (const a of [...csas.loader.bitmaps.keys()]) csas.loader.forget(a);"
+        " csas.moved = performance.now(); csas.prefetch(); setInterval(() => csas.idle(), 1); })()"
+    )
+    alone(watched)
+
+
+def test_a_list_that_holds_nothing_new_is_told_as_filled(watched: Any, serve: Any) -> None:
+    watched.open(serve(store_of_slopes()))
+    alone(watched)
+    watched.js(
+        "(() => { csas.loader.told = 0; const old = csas.loader.changed;"
+        " csas.loader.changed = (a) => { csas.loader.told += !a; old(a); };"
+        " csas.loader.fetchAll([...csas.loader.blobs.keys()]); })()"
+    )
+    assert watched.js("csas.loader.told") == 1

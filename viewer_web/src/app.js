@@ -329,7 +329,10 @@ class App {
           if (v) wanted.push(this.address(p.layer, v, "jpg"));
         }
       }
-    this.loader.want([...new Set(wanted)], this.idle() ? this.others() : []);
+    const idle = this.idle(), left = this.idleIn();
+    clearTimeout(this.idling);
+    if (!idle && left > 0) this.idling = setTimeout(() => this.prefetch(), left + 20);
+    this.loader.want([...new Set(wanted)], idle ? this.others() : []);
   }
 
   // All views of both pictures, the nearest to the cursor last.
@@ -348,11 +351,11 @@ class App {
   idle() {
     const state = this.scene.progress?.state;
     if (this.playing || state === "running" || state === "loading" || document.hidden || !this.loader.filled) return false;
-    const left = IDLE_MS - (performance.now() - (this.moved ?? 0));
-    clearTimeout(this.idling);
-    if (left > 0) this.idling = setTimeout(() => this.prefetch(), left + 20);
-    return left <= 0;
+    return this.idleIn() <= 0;
   }
+
+  // When (ms) it has been left alone for long enough.
+  idleIn() { return IDLE_MS - (performance.now() - (this.moved ?? 0)); }
 
   // Whether a drawing lacks what was just decoded; an outline tells nothing.
   awaits(address) {

@@ -92,6 +92,10 @@ export class Loader {
       const a = this.all.shift();
       if (!this.blobs.has(a) && !this.outlines.has(a) && !this.busy.has(a)) this.fetch(a);
     }
+    if (this.filling && this.filled) {
+      this.filling = false;
+      this.changed(); // the page may decode ahead now
+    }
     while (this.ahead.length && this.running("decode") < DECODES) {
       const a = this.ahead.pop(), part = this.partOf(a)?.decoded;
       if (this.busy.has(a) || !this.blobs.has(a) || this.covered(a)) continue;
@@ -120,10 +124,6 @@ export class Loader {
       setTimeout(() => this.pump(), 2100);
     }
     this.busy.delete(a);
-    if (this.filling && this.filled) {
-      this.filling = false;
-      this.changed(); // the page may decode ahead now
-    }
     this.pump();
   }
 
