@@ -488,6 +488,7 @@ def test_a_replay_can_be_watched_and_its_page_goes_on_with_the_results(watched, 
             "!csas.scene.live && csas.views('shadow').length === 36 && csas.scene.contacts.length", 90
         )
     finally:
+        watched.page.goto("about:blank")  # it would ask for a server that has ended, and say so late
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0
         process.stderr.close()

@@ -525,6 +525,10 @@ def test_what_a_page_that_is_open_shows_holds_on_a_laptop(watched, serve, small,
     goes_through(desktop(watched, serve, small, tmp_path, 1366, 768), LINES[:OPEN])
 
 
+def test_nothing_runs_off_a_phones_screen(watched, serve, small, tmp_path):
+    goes_through(desktop(watched, serve, small, tmp_path, 390, 844), LINES[:1])
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("width", "height"), SCREENS)
 def test_every_line_holds_on_every_screen(watched, serve, three, tmp_path, width, height):
