@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csas_shadow_ros.core.errors import AdapterError, CsasError
+from csas_shadow_ros.core.errors import AdapterError, CsasError, quoted
 from csas_shadow_ros.core.geometry import (
     SCENE_FRAME,
     TWO_PI,
@@ -33,7 +33,6 @@ from .messages import (
     check_type,
     frame_of,
     make_header,
-    quoted,
     stamp_to_ns,
 )
 from .topics import (

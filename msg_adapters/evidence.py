@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from csas_shadow_ros.core.errors import MAX_STAMP_NS, AdapterError
+from csas_shadow_ros.core.errors import MAX_STAMP_NS, AdapterError, quoted
 from csas_shadow_ros.core.shape.result import ViewEvidence
 
-from .messages import MessageFactory, quoted
+from .messages import MessageFactory
 from .statuses import Status, Value, statuses_from_msg, statuses_to_msg
 
 _WHERE = "evidence"

@@ -9,9 +9,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from csas_shadow_ros.core.errors import AdapterError
+from csas_shadow_ros.core.errors import AdapterError, quoted
 
-from .messages import MessageFactory, check_type, frame_of, make_header, quoted
+from .messages import MessageFactory, check_type, frame_of, make_header
 from .topics import IMAGE, MATTER_ENCODING, VOXEL_ENCODING, ImageStream, stream
 
 MAX_SIDE = 1 << 16

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from csas_shadow_ros.core.errors import AdapterError, CsasError
+from csas_shadow_ros.core.errors import AdapterError, CsasError, quoted
 from csas_shadow_ros.core.geometry import SCENE_FRAME, Datum, Place
 from csas_shadow_ros.core.methods import METHODS
 from csas_shadow_ros.core.shape.mesh import Dimensions
@@ -17,7 +17,7 @@ from csas_shadow_ros.core.shape.result import QUALITIES, VERDICTS, LeftOut, Obje
 from csas_shadow_ros.core.shape.seabed import SeabedSlope
 from csas_shadow_ros.core.shape.volume import Target, VoxelGrid
 
-from .messages import MessageFactory, frame_of, quoted
+from .messages import MessageFactory, frame_of
 from .progress import Level
 from .statuses import (
     RUN,

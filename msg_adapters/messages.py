@@ -16,9 +16,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from csas_shadow_ros.core.errors import MAX_STAMP_NS, AdapterError
+from csas_shadow_ros.core.errors import MAX_STAMP_NS, AdapterError, quoted
 from csas_shadow_ros.core.frame_name import SCENE_FRAME as SCENE_FRAME
-from csas_shadow_ros.core.frame_name import is_frame
+from csas_shadow_ros.core.frame_name import check_frame
 
 NANOSECONDS = 1_000_000_000
 
@@ -32,25 +32,6 @@ FLOAT_TYPES = ("float", "double", "float32", "float64")
 
 #: No place on Earth has a larger coordinate on any map (m): half of the equator. UTM has up to 10 000 km.
 MAX_COORDINATE_M = 2.004e7
-#: So many characters of a message's value are quoted: an encoding or a frame is shorter, and a line of the
-#: terminal holds it with what was expected.
-MAX_QUOTED = 40
-
-
-def quoted(value: Any) -> str:
-    """Quote a value for an error: a text in quotation marks, cut to about 40 characters.
-
-    Examples
-    --------
-    >>> quoted("map")
-    "'map'"
-    >>> quoted("m" * 1_000_000)
-    "'mmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmm'… (1000000 characters)"
-    """
-    if isinstance(value, str) and len(value) > MAX_QUOTED:
-        return f"{value[:MAX_QUOTED]!r}… ({len(value)} characters)"
-    text = repr(value)
-    return text if len(text) <= 2 * MAX_QUOTED else f"{text[:MAX_QUOTED]}…"
 
 
 class MessageFactory(Protocol):
@@ -481,12 +462,7 @@ def frame_of(msg: Any, where: str, expected: str = "") -> str:
     AdapterError
         If it has none, or another one; the error names it.
     """
-    frame = msg.header.frame_id
-    if not is_frame(frame):
-        raise AdapterError(
-            f"{where}.header.frame_id is {quoted(frame)}; expected the name of the scene's frame, such as"
-            f" {SCENE_FRAME!r}"
-        )
+    frame = check_frame(f"{where}.header.frame_id", msg.header.frame_id, AdapterError)
     if expected and frame != expected:
         raise AdapterError(f"{where}.header.frame_id is {quoted(frame)}; expected {expected!r}")
     return frame

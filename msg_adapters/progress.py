@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
-from csas_shadow_ros.core.errors import AdapterError
+from csas_shadow_ros.core.errors import MAX_QUOTED, AdapterError, quoted
 
-from .messages import MAX_QUOTED, MessageFactory, check_type, make_header, quoted, stamp_to_ns
+from .messages import MessageFactory, check_type, make_header, stamp_to_ns
 from .topics import DIAGNOSTICS
 
 HEARTBEAT = "heartbeat"

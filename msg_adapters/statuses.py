@@ -11,11 +11,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from csas_shadow_ros.core.errors import AdapterError
+from csas_shadow_ros.core.errors import AdapterError, quoted
 from csas_shadow_ros.core.shape.result import LeftOut
 from csas_shadow_ros.core.shape.volume import Target
 
-from .messages import MessageFactory, check_type, frame_of, make_header, quoted, stamp_to_ns
+from .messages import MessageFactory, check_type, frame_of, make_header, stamp_to_ns
 from .progress import Level
 from .topics import DIAGNOSTICS
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csas_shadow_ros.core.errors import AdapterError, CsasError
+from csas_shadow_ros.core.errors import AdapterError, CsasError, quoted
 from csas_shadow_ros.core.geometry import Track, TrackPiece
 
 from .messages import (
@@ -21,7 +21,6 @@ from .messages import (
     frame_of,
     make_header,
     point,
-    quoted,
     stamp_to_ns,
 )
 from .topics import PATH

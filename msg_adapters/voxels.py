@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csas_shadow_ros.core.errors import AdapterError
+from csas_shadow_ros.core.errors import AdapterError, quoted
 from csas_shadow_ros.core.shape.volume import VoxelGrid
 
-from .messages import MessageFactory, check_type, frame_of, make_header, quoted, stamp_to_ns
+from .messages import MessageFactory, check_type, frame_of, make_header, stamp_to_ns
 from .topics import POINT_CLOUD
 
 _POINT = np.dtype(

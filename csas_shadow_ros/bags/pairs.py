@@ -7,8 +7,8 @@ from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from csas_shadow_ros.core.errors import CsasError
-from msg_adapters.messages import quoted, stamp_to_ns
+from csas_shadow_ros.core.errors import CsasError, quoted
+from msg_adapters.messages import stamp_to_ns
 from msg_adapters.topics import TOPICS, absolute_name, stream
 
 from .bag import BagMessage, BagReader

@@ -6,10 +6,10 @@ import contextlib
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from csas_shadow_ros.core.errors import BagError, CsasError
+from csas_shadow_ros.core.errors import BagError, CsasError, quoted
 from csas_shadow_ros.core.geometry import SCENE_FRAME, Origin, Track, TrackBook, ViewInfo, origin_of, passage
 from msg_adapters.camera_info import view_info_from_msg
-from msg_adapters.messages import frame_of, quoted
+from msg_adapters.messages import frame_of
 from msg_adapters.origin import origin_from_msg
 from msg_adapters.topics import STREAMS, VIEW_STREAMS, absolute_name
 from msg_adapters.track import track_piece_from_msg

@@ -8,8 +8,9 @@ from numbers import Complex, Real
 
 #: The latest stamp of ROS 2: int32 seconds and a second's nanoseconds.
 MAX_STAMP_NS = (1 << 31) * 1_000_000_000 - 1
-#: What an error quotes of a value.
-_MOST_QUOTED = 60
+#: So many characters of a value are quoted: an encoding or a frame is shorter, and a line of the terminal
+#: holds it with what was expected.
+MAX_QUOTED = 40
 
 
 class CsasError(Exception):
@@ -70,10 +71,22 @@ class MissingExtraError(CsasError, ImportError):
     """A library of one function is not installed; the message names the extra that brings it."""
 
 
-def shown(value: object) -> str:
-    """Return a value for an error: on one line, cut short."""
+def quoted(value: object) -> str:
+    """Quote a value for an error, on one line: a text in quotation marks, cut to about 40 characters.
+
+    Examples
+    --------
+    >>> quoted("map")
+    "'map'"
+    >>> quoted("m" * 1_000_000)
+    "'mmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmmm'… (1000000 characters)"
+    """
+    if isinstance(value, str):
+        if len(value) > MAX_QUOTED:
+            return f"{value[:MAX_QUOTED]!r}… ({len(value)} characters)"
+        return repr(value)
     text = " ".join(repr(value).split())
-    return text if len(text) <= _MOST_QUOTED else f"{text[:_MOST_QUOTED]}…"
+    return text if len(text) <= 2 * MAX_QUOTED else f"{text[:MAX_QUOTED]}…"
 
 
 def check_type(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
@@ -121,7 +134,7 @@ def check_number(name: str, value: object) -> float:
             raise TypeError
         return float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
-        raise ParameterError(f"{name} is {shown(value)}; expected a number") from None
+        raise ParameterError(f"{name} is {quoted(value)}; expected a number") from None
 
 
 def check_finite(name: str, value: object, unit: str = "") -> float:
@@ -152,7 +165,7 @@ def check_numbers(name: str, values: object, count: int, unit: str = "") -> tupl
         parts = []
     if len(parts) != count:
         many = {2: "two", 3: "three"}.get(count, count)
-        raise ParameterError(f"{name} is {shown(values)}; expected {many} numbers")
+        raise ParameterError(f"{name} is {quoted(values)}; expected {many} numbers")
     return tuple(check_finite(name, part, unit) for part in parts)
 
 
@@ -169,10 +182,10 @@ def check_whole(name: str, value: object, low: int, high: int, unit: str = "") -
     try:
         number = operator.index(value)  # type: ignore[arg-type]
     except TypeError:
-        raise InputTypeError(f"{name} is {shown(value)}; expected a whole number") from None
+        raise InputTypeError(f"{name} is {quoted(value)}; expected a whole number") from None
     if not low <= number <= high:
         unit = f" {unit}" if unit else ""
-        raise ParameterError(f"{name} is {shown(number)}{unit}; expected [{low}, {high}]{unit}")
+        raise ParameterError(f"{name} is {quoted(number)}{unit}; expected [{low}, {high}]{unit}")
     return number
 
 

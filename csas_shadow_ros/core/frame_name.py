@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TypeGuard
 
-from .errors import InputTypeError, shown
+from .errors import CsasError, InputTypeError, quoted
 
 #: The scene frame's name where nobody gives another one.
 SCENE_FRAME = "csas_scene"
@@ -17,16 +17,16 @@ def is_frame(value: object) -> TypeGuard[str]:
     return isinstance(value, str) and bool(value.strip()) and len(value) <= _MAX_FRAME
 
 
-def check_frame(what: str, value: object) -> None:
-    """Raise unless a value can be the name of the frame that something is in.
+def check_frame(what: str, value: object, error: type[CsasError] = InputTypeError) -> str:
+    """Return the name of the frame that something is in.
 
     Raises
     ------
-    InputTypeError
-        Naming it.
+    CsasError
+        Of the given kind, if it can be none; it names what and value.
     """
-    if not is_frame(value):
-        raise InputTypeError(
-            f"frame of the {what} is {shown(value)}; expected the name of the scene's frame, such as"
-            f" {SCENE_FRAME!r}"
-        )
+    if is_frame(value):
+        return value
+    raise error(
+        f"{what} is {quoted(value)}; expected the name of the scene's frame, such as {SCENE_FRAME!r}"
+    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from .errors import ParameterError, shown
+from .errors import ParameterError, quoted
 
 Method = Literal["consensus", "hard", "soft"]
 
@@ -124,7 +124,7 @@ def method_named(name: object) -> CarvingMethod:
         If there is none of that name; the message names all.
     """
     if not isinstance(name, str) or name not in METHODS:
-        raise ParameterError(f"method is {shown(name)}; expected one of: {', '.join(get_args(Method))}")
+        raise ParameterError(f"method is {quoted(name)}; expected one of: {', '.join(get_args(Method))}")
     return METHODS[name]
 
 

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import GeometryError, check_whole, shown
+from ..errors import GeometryError, check_whole, quoted
 from .frames import FloatArray, cross_range_axis, down_range_axis
 
 
@@ -63,7 +63,7 @@ class ShadowCamera:
         given = np.asarray(self.projection)
         if given.size != 12 or given.dtype.kind not in "fiu":
             raise GeometryError(
-                f"P is {shown(self.projection)} of shape {given.shape}; expected numbers of shape (3, 4)"
+                f"P is {quoted(self.projection)} of shape {given.shape}; expected numbers of shape (3, 4)"
             )
         p = np.array(given, dtype=np.float64).reshape(3, 4)
         if not np.all(np.isfinite(p)):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import GeometryError, ParameterError, check_finite, check_range, check_whole, shown
+from ..errors import GeometryError, ParameterError, check_finite, check_range, check_whole, quoted
 
 FloatArray = NDArray[np.float64]
 
@@ -94,7 +94,7 @@ class Acoustics:
         # The upper bound is the speed of light: the same formulas serve radar test data.
         check_range("sound speed", self.sound_speed_mps, 0, 3e8, "m/s", open_low=True)
         if isinstance(self.spectrum_sign, str) or self.spectrum_sign not in (1, -1):
-            raise ParameterError(f"spectrum_sign is {shown(self.spectrum_sign)}; expected +1 or -1")
+            raise ParameterError(f"spectrum_sign is {quoted(self.spectrum_sign)}; expected +1 or -1")
         object.__setattr__(self, "spectrum_sign", int(self.spectrum_sign))
 
     def ground_wavenumber(self, frequency_hz: float, grazing_rad: float) -> float:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import MAX_STAMP_NS, GeometryError, InputTypeError, ParameterError, TrackError, shown
+from ..errors import MAX_STAMP_NS, GeometryError, InputTypeError, ParameterError, TrackError, quoted
 
 #: Numbers of a coherent image.
 COHERENT = ("complex64", "complex128")
@@ -114,7 +114,7 @@ def positions_of(what: str, values: ArrayLike) -> NDArray[np.float64]:
     given = _array(f"positions of the {what}", values, "numbers of shape (n, 3)")
     if given.size and given.dtype.kind not in "fiu":
         raise InputTypeError(
-            f"positions of the {what} are {given.dtype}, the first {shown(given.flat[0])}; expected real"
+            f"positions of the {what} are {given.dtype}, the first {quoted(given.flat[0])}; expected real"
             " numbers, metres"
         )
     return np.array(given, dtype=np.float64)
@@ -123,7 +123,7 @@ def positions_of(what: str, values: ArrayLike) -> NDArray[np.float64]:
 def _whole(what: str, values: ArrayLike) -> NDArray[np.int64]:
     given = _array(what, values, "whole numbers")
     if given.size and given.dtype.kind not in "iu":
-        first = shown(given.ravel().tolist()[0])
+        first = quoted(given.ravel().tolist()[0])
         raise InputTypeError(f"{what} are {given.dtype}, the first {first}; expected whole numbers")
     return np.array(given, dtype=np.int64)
 

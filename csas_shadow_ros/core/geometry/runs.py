@@ -55,7 +55,7 @@ class TrackPiece:
     frame: str = field(default=SCENE_FRAME, kw_only=True)
 
     def __post_init__(self) -> None:
-        check_frame("piece of a track", self.frame)
+        check_frame("frame of the piece of a track", self.frame)
         stamps = stamps_of("piece of a track", self.stamps_ns)
         positions = positions_of("piece of a track", self.positions_m)
         if stamps.ndim != 1 or not len(stamps) or positions.shape != (len(stamps), 3):

@@ -95,7 +95,7 @@ class Track:
         doubtful: Sequence[DoubtfulArc] = (),
         frame: str = SCENE_FRAME,
     ) -> None:
-        check_frame("track", frame)
+        check_frame("frame of the track", frame)
         stamps, positions = stamps_of("track", stamps_ns), positions_of("track", positions_m)
         if positions.ndim != 2 or positions.shape[1] != 3 or stamps.shape != positions.shape[:1]:
             raise TrackError(

@@ -66,7 +66,7 @@ class ViewInfo:
         check_range("aperture of the view", self.aperture_rad, 0.0, TWO_PI * (1.0 + 1e-9), "rad")
         check_numbers("carrier of the view", self.carrier_rad_m, 2, "rad/m")
         check_number("focus range of the view", self.focus_range_m)
-        check_frame("view", self.frame)
+        check_frame("frame of the view", self.frame)
 
     @property
     def resolution_m(self) -> tuple[float, float]:
@@ -156,7 +156,7 @@ class CoherentImage:
         check_type("grid of the image", self.grid, GroundGrid, "a GroundGrid")
         check_type("acoustics of the image", self.acoustics, Acoustics, "an Acoustics")
         object.__setattr__(self, "stamp_ns", check_stamp("image", self.stamp_ns))
-        check_frame("image", self.frame)
+        check_frame("frame of the image", self.frame)
         check_pixels("image", self.pixels, self.grid.shape, "grid", COHERENT)
         check_finite_pixels("image", self.pixels)
 

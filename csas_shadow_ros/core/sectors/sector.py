@@ -98,7 +98,7 @@ class Sector:
         check_finite("aspect of the sector", self.aspect_rad, "rad")
         check_finite("arc of the sector", self.aperture_rad, "rad")
         check_numbers("carrier of the sector", self.carrier_rad_m, 2, "rad/m")
-        check_frame("sector", self.frame)
+        check_frame("frame of the sector", self.frame)
         # That they are finite is seen where they are read, and where they are summed: a sector comes often.
         check_pixels("sector", self.pixels, self.grid.shape, "grid", COHERENT)
 

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import GeometryError, InputTypeError, check_numbers, check_range, check_type, check_whole, shown
+from ..errors import (
+    GeometryError,
+    InputTypeError,
+    check_numbers,
+    check_range,
+    check_type,
+    check_whole,
+    quoted,
+)
 from ..methods import method_named
 
 if TYPE_CHECKING:
@@ -72,7 +80,7 @@ class Volume:
         check_range("voxel size", self.voxel_size_m, 0, 1e4, "m", open_low=True)
         check_numbers("origin of the volume", self.origin_m, 3, "m")
         if not isinstance(self.shape, tuple) or len(self.shape) != 3:
-            raise InputTypeError(f"shape of the volume is {shown(self.shape)}; expected three whole numbers")
+            raise InputTypeError(f"shape of the volume is {quoted(self.shape)}; expected three whole numbers")
         for axis, n in zip("zyx", self.shape, strict=True):
             check_whole(f"number of voxels along {axis}", n, 1, 1 << 14)
 
