@@ -74,6 +74,7 @@ from .params import DYNAMIC, NODES, declare, from_overrides
 from .rivals import Rivals
 from .secured import security_told
 from .shared_memory import tidy_up_after_a_killed_graph
+from .watchdog import ends_if_it_stands_still
 
 NAMESPACE = "csas"
 BEAT_S = 0.5
@@ -1260,11 +1261,12 @@ def run_node(kind: type[CsasNode], arguments: Sequence[str] | None = None) -> in
         node.destroy_node()
         rclpy.try_shutdown(context=node.context)
 
-    while True:
-        reach, code = _run_once(kind, make, take_back, stop)
-        if not reach.is_given_up or stop.is_set():
-            return code
-        reach.take_others()
+    with ends_if_it_stands_still():
+        while True:
+            reach, code = _run_once(kind, make, take_back, stop)
+            if not reach.is_given_up or stop.is_set():
+                return code
+            reach.take_others()
 
 
 def _run_once(
