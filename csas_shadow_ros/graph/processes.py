@@ -660,7 +660,7 @@ class Graph:
             code = process.poll()
             if code is None:
                 continue
-            if code < 0:
+            if code not in (0, 2):  # killed, or ended by itself where it stood
                 self._death_s = time.time()
             if code == 2:
                 raise ReplayError(f"{name} refused to start: {process.last_line()}")
