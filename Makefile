@@ -22,6 +22,8 @@ ACCURACY_ARGUMENTS ?=
 POPULATION_ARGUMENTS ?= --half development --scenes 60 --workers 2 --out build/population
 # Of the harness of kills, which goes on where it was: make soak SOAK_ARGUMENTS='--seed 200 --trials 200'
 SOAK_ARGUMENTS ?= --trials 200 --circles 200 --same-draw 30 --two-graphs 30 --soak 3600
+# How long each kind of input is fuzzed (s): make fuzz FUZZ_SECONDS=3600
+FUZZ_SECONDS ?= 60
 # And of the speed benchmark: make bench BENCH_ARGUMENTS='--only chain carving'
 BENCH_ARGUMENTS ?=
 FROM_NPM := mermaid@11.12.0 @fontsource/stix-two-math@5.3.0
@@ -36,7 +38,7 @@ SOURCES := $(shell find csas_shadow_ros msg_adapters config launch -type f \
 	-not -name '*.pyc' -not -path '*/__pycache__*' 2>/dev/null)
 PACKAGING := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help venv install demo docs test lint types unit long soak accuracy accuracy-short population bench build lock clean
+.PHONY: help venv install demo docs test lint types unit long soak fuzz accuracy accuracy-short population bench build lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -103,6 +105,10 @@ long: install ## the tests that `make test` leaves out: more of the same
 soak: install ## kills, stops, full disks: hundreds of trials, and an hour in one graph
 	@mkdir -p $(ROS_LOG_DIR)
 	$(PY) test/faults/soak.py $(SOAK_ARGUMENTS)
+
+fuzz: install ## bags and messages, guided by coverage: Atheris, a minute each
+	$(PY) -m pip install --quiet --disable-pip-version-check 'atheris>=3,<4'
+	for each in message mcap db3 yaml; do $(PY) test/faults/fuzz.py $$each --seconds $(FUZZ_SECONDS); done
 
 accuracy-short: install ## a few cases of it against their floors, in a minute
 	$(PY) benchmarks/accuracy.py --short

@@ -363,7 +363,9 @@ def _refuse(bad: NDArray[np.bool_], pixels: NDArray[Any], where: str, fault: str
         return
     first = tuple(int(i) for i in np.unravel_index(int(bad.argmax()), bad.shape))
     place = "row {}, column {}".format(*first) + (f", channel {first[2]}" if len(first) > 2 else "")
+    with np.errstate(invalid="ignore"):  # a signalling NaN warns even of its text
+        value = f"{pixels[first]}"
     raise AdapterError(
         f"{where} has {int(bad.sum())} of {bad.size} pixels {fault}, the first at {place}"
-        f" ({pixels[first]}); expected {expected}"
+        f" ({value}); expected {expected}"
     )
