@@ -36,6 +36,7 @@ from ..nodes.runtime.shared_memory import (
     remove_strays,
     unused,
 )
+from ..nodes.runtime.watchdog import STANDS_STILL_S, says_that_it_stood_still
 
 PACKAGE = "csas_shadow_ros"
 #: The ports of higher domains do not exist.
@@ -581,8 +582,10 @@ class GraphProcess:
 
     def last_line(self) -> str:
         """Return the last line of the process' output."""
-        lines = self.log.read_text(errors="replace").strip().splitlines() if self.log.exists() else []
-        return lines[-1] if lines else "no output"
+        text = self.log.read_text(errors="replace").strip() if self.log.exists() else ""
+        if says_that_it_stood_still(text):
+            return f"it stood still for {STANDS_STILL_S:g} s; {self.log} has the stack of every thread"
+        return text.splitlines()[-1] if text else "no output"
 
 
 class Graph:

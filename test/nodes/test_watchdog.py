@@ -12,6 +12,8 @@ import pytest
 
 pytest.importorskip("rclpy")
 
+from csas_shadow_ros.nodes.runtime.watchdog import says_that_it_stood_still
+
 #: As rclpy's publish does while the middleware waits: nothing else of Python runs until it returns.
 KEEPS_THE_INTERPRETER = "ctypes.PyDLL(None).sleep(60)"
 
@@ -41,6 +43,10 @@ def test_a_process_whose_interpreter_stands_still_ends_with_its_stacks_in_the_lo
     """)
     assert code == 1
     assert "in publish" in said
+    assert says_that_it_stood_still(said)
+    assert says_that_it_stood_still(f"[INFO] active\n{said.strip()}")
+    assert not says_that_it_stood_still(f"{said}[INFO] active: its successor\n")
+    assert not says_that_it_stood_still("[ERROR] Timeout (of something else)")
 
 
 def test_a_node_that_stands_still_in_a_callback_ends(domain: int) -> None:

@@ -19,6 +19,8 @@ from collections.abc import Iterator
 #: there, but not on a machine that swaps. Double, with a restart, comes near to the 60 s for which a silent
 #: source is waited.
 STANDS_STILL_S = 20.0
+#: What faulthandler writes before the stacks.
+_HEADER = "Timeout ("
 #: How often in this time a living one says so.
 _SIGNS = 10
 
@@ -50,3 +52,12 @@ def ends_if_it_stands_still(stands_still_s: float = STANDS_STILL_S) -> Iterator[
         ended.set()
         thread.join()
         faulthandler.cancel_dump_traceback_later()
+
+
+def says_that_it_stood_still(log: str) -> bool:
+    """Say whether a log ends with the stacks of a process that ended itself so."""
+    _, found, stacks = log.rpartition(f"\n{_HEADER}")
+    if not found and not log.startswith(_HEADER):
+        return False
+    lines = (stacks if found else log).splitlines()[1:]
+    return all(not line or line.startswith(("Thread ", "Current thread ", "  ")) for line in lines)
