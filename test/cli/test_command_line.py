@@ -282,7 +282,7 @@ def test_the_image_is_in_the_result_bag_byte_for_byte(results, tiny_box_bag):
 # -- other starts, parameters -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stage", ["sub_aperture", "shadow"])
+@pytest.mark.parametrize("stage", [pytest.param("sub_aperture", marks=pytest.mark.long), "shadow"])
 def test_a_run_from_recorded_views_gives_the_shape_of_the_run_from_the_image(results, tmp_path, stage):
     said = run_quickly(results / "result.mcap", tmp_path / "r", "--start-from", stage)
     whole = read_report(results)["dimensions"]
@@ -330,7 +330,9 @@ def test_without_a_hollow_there_is_one_surface_alone(results):
     assert "hollows" not in (results / "summary.txt").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("stage", ["sub_aperture", "shadow", "shadow_mask"])
+@pytest.mark.parametrize(
+    "stage", ["sub_aperture", pytest.param("shadow", marks=pytest.mark.long), "shadow_mask"]
+)
 def test_views_of_a_result_leave_the_same_result_from_every_stage(results, tmp_path, stage):
     said = run_quickly(results / "result.mcap", tmp_path / "r", "--start-from", stage)
     assert said.code == 0, said.err

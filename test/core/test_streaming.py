@@ -87,8 +87,17 @@ def with_a_hole(sectors):
     return [*sectors[:4], *sectors[6:]]
 
 
-@pytest.mark.parametrize("parameters", [AUTO, GIVEN], ids=["auto", "given"])
-@pytest.mark.parametrize("order", [in_order, shuffled_with_repeats, with_a_hole])
+@pytest.mark.parametrize(
+    ("order", "parameters"),
+    [
+        pytest.param(in_order, AUTO, id="in_order-auto", marks=pytest.mark.long),
+        pytest.param(shuffled_with_repeats, AUTO, id="shuffled-auto"),
+        pytest.param(with_a_hole, AUTO, id="with_a_hole-auto"),
+        pytest.param(in_order, GIVEN, id="in_order-given", marks=pytest.mark.long),
+        pytest.param(shuffled_with_repeats, GIVEN, id="shuffled-given"),
+        pytest.param(with_a_hole, GIVEN, id="with_a_hole-given", marks=pytest.mark.long),
+    ],
+)
 def test_the_grid_is_that_of_the_whole_run_bit_for_bit(simulated, sectors, order, parameters):
     come = order(sectors)
     run = streamed(come, simulated.track, parameters)

@@ -320,7 +320,14 @@ def test_an_image_with_a_pixel_that_is_not_finite_is_refused_by_its_place():
         Spectrum.of_image(image)
 
 
-@pytest.mark.parametrize("method", ["consensus", "hard", "soft"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        "consensus",
+        pytest.param("hard", marks=pytest.mark.long),
+        pytest.param("soft", marks=pytest.mark.long),
+    ],
+)
 def test_shadows_that_leave_the_image_leave_unknown_voxels_and_no_roof(method):
     height = 0.4
     run = simulate("tiny", box(0.8, 0.4, height), seed=3)
