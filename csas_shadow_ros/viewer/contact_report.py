@@ -31,7 +31,7 @@ from ..core.shape.mesh import mesh_from_grid
 from .contacts import axis_bearing_deg
 from .crop import HIGH_SHOWN_DB as _HIGH
 from .crop import LOW_SHOWN_DB as _LOW
-from .crop import Window, cast, contact_named, grey_of, outlines, shadow_m, to_north
+from .crop import Window, cast, colours_of, contact_named, grey_of, outlines, shadow_m, to_north
 from .server import STATIC
 from .store import Entry, ViewStore
 
@@ -363,10 +363,8 @@ def _draw_shadow(
 
 
 def _draw_colours(axes: Any, store: ViewStore, contact: Mapping[str, Any], north: float) -> None:
-    info, _, pixels = store.pictures["color_by_aspect"]
-    up = to_north(north)
-    window = Window(contact["position_m"], _ROUND * contact["size_m"], up, _PICTURE_PX)
-    _picture(axes, window, window.cut(info.grid.ground_to_pixel, pixels, 255))
+    window = Window(contact["position_m"], _ROUND * contact["size_m"], to_north(north), _PICTURE_PX)
+    _picture(axes, window, colours_of(window, store, unknown=255))
     wheel = axes.inset_axes((0.8, 0.8, 0.19, 0.19))
     y, x = np.mgrid[1:-1:120j, -1:1:120j]
     hue = (np.arctan2(y, x) / math.tau + north / 360.0) % 1.0

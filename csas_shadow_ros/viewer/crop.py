@@ -136,6 +136,19 @@ def grey_of(window: Window, entry: Entry, kind: str, unknown: int = 0) -> NDArra
     return np.where(known, grey(cut), np.uint8(unknown))
 
 
+def colours_of(window: Window, store: ViewStore, unknown: int = 0) -> NDArray[np.uint8]:
+    """Return the colours by aspect in a window; `unknown` is the grey of what no sonar has seen."""
+    info, _, pixels = store.pictures["color_by_aspect"]
+    onto = info.grid.ground_to_pixel
+    cut = window.cut(onto, pixels, unknown)
+    # Black is what was not seen, and what is very dark; the levels tell the two apart.
+    levels = store.pictures["multilook"][2] if "multilook" in store.pictures else None
+    if levels is None or levels.shape != pixels.shape[:2]:
+        return cut
+    known = window.cut(onto, np.where(levels > 0, np.uint8(255), np.uint8(0))) == 255
+    return np.where(known[..., None], cut, np.uint8(unknown))
+
+
 def outlines(store: ViewStore, stamp_ns: int, window: Window) -> list[NDArray[np.float64]]:
     """Return the outlines of a view's segmented shadow in a window; none where there is no mask."""
     entry = store.sets["shadow_mask"].get(stamp_ns)
@@ -228,4 +241,14 @@ def _round_length(goal_m: float) -> float:
     return next(m * ten for m in (5.0, 2.0, 1.0) if m * ten <= goal_m)
 
 
-__all__ = ["Window", "cast", "contact_named", "grey_of", "moving_picture", "outlines", "shadow_m", "to_north"]
+__all__ = [
+    "Window",
+    "cast",
+    "colours_of",
+    "contact_named",
+    "grey_of",
+    "moving_picture",
+    "outlines",
+    "shadow_m",
+    "to_north",
+]

@@ -313,3 +313,21 @@ def test_what_no_sonar_has_seen_is_not_printed_as_shadow() -> None:
     assert set(np.unique(whole)) == {level, 255}
     assert set(np.unique(seen)) == {level, 255}, "no dark fringe where what is known ends"
     assert (seen == level).sum() == pytest.approx((whole == level).sum() / 2, rel=0.03)
+
+
+def test_what_no_sonar_has_seen_is_white_in_the_colours_too(run_store: ViewStore) -> None:
+    import numpy as np
+
+    from csas_shadow_ros.viewer.crop import Window, colours_of
+
+    store = ViewStore()
+    for name in ("multilook", "color_by_aspect"):
+        info, _, pixels = run_store.pictures[name]
+        half = pixels.copy()
+        half[: len(half) // 2] = 0
+        store.put_picture(name, info, half)
+    window = Window((0.0, 0.0), 1.0, (0.0, 1.0), 300)
+    seen, whole = colours_of(window, store, 255), colours_of(window, run_store, 255)
+    white = (seen == 255).all(axis=2)
+    assert white.mean() == pytest.approx(0.5, abs=0.03)
+    assert np.array_equal(seen[~white], whole[~white]), "no dark fringe where what is known ends"

@@ -315,6 +315,22 @@ def test_an_empty_picture_says_what_it_waits_for(watched, serve):
     watched.until(f"{empty} === ''")
 
 
+def test_what_there_is_nothing_to_make_of_is_not_offered(watched, serve, run_store):
+    live = ViewStore(title="live", live=True)
+    watched.page.goto(serve(live))
+    watched.until("window.csas && csas.scene.instance")
+    watched.drawn()
+    for button in ("#report", "#save-circle", "#save-picture"):
+        assert watched.page.locator(button).is_disabled(), button
+    live.put_view("shadow", next(iter(run_store.sets["shadow"].values())))
+    watched.until("!document.querySelector('#save-picture').disabled")
+    assert watched.page.locator("#report").is_disabled()
+    watched.open(serve(run_store))
+    watched.drawn()
+    for button in ("#report", "#save-circle", "#save-picture"):
+        assert watched.page.locator(button).is_enabled(), button
+
+
 @pytest.mark.long
 def test_a_finished_run_says_what_it_does_not_hold(watched, serve):
     store = ViewStore(title="one")

@@ -70,7 +70,11 @@ def test_a_contact_that_is_chosen_is_gone_to_judged_and_kept(watched, serve, sev
     assert watched.js("csas.solid.controls.target.toArray().slice(0, 2)") == pytest.approx(place)
     assert re.search(r"Length\s+[\d.]+ ± [\d.]+ m", page.locator("#dimensions").inner_text())
     assert "1 rejected" in page.locator("#facts").inner_text()
+    assert "a phantom" in page.locator("[data-contact=left-out-1]").inner_text(), "the list itself says why"
+    page.click("[data-contact=object-1]")
+    watched.until("!document.querySelector('#why-here').hidden")
     page.click("[data-contact=left-out-1]")
+    assert not page.locator("#why-here").is_visible(), "there is no surface of it"
     assert "May be an object: a phantom" in page.locator("#facts").inner_text()
     page.click("[data-contact=object-3]")
     page.fill("[name=remark]", "fins at one end")
@@ -107,6 +111,75 @@ def test_a_contact_that_is_chosen_is_gone_to_judged_and_kept(watched, serve, sev
     watched.page.click("[data-contact=object-3]")
     assert watched.page.input_value("[name=remark]") == "rock?"
     assert watched.page.locator("[name=remark]").is_disabled()
+
+
+def test_evidence_of_a_run_with_several_contacts_is_shown_and_leaves_the_threshold(watched, serve, several):
+    watched.open(serve(read(several)))
+    watched.until("csas.solid.further.object_3?.[0].geometry.index?.count > 0 && csas.solid.sides.other.triangles > 0")
+    told = "['main', 'other'].map(n => document.querySelector(`#row-${n} output`).textContent)"
+    before = watched.js(told)
+    watched.page.check("#evidence")
+    watched.js("csas.solid.render()")
+    assert watched.js("csas.solid.sides.main.points.visible && csas.solid.sides.main.points.geometry.attributes.position.count") > 0
+    assert watched.js(told) == before
+    for name in ("main", "other"):
+        assert watched.page.locator(f"#auto-{name}").is_disabled(), "it is still at the automatic threshold"
+
+
+def test_side_by_side_the_other_method_claims_no_contact_that_it_did_not_carve(watched, serve, several):
+    watched.open(serve(read(several)))
+    watched.until("csas.solid.further.object_3?.[0].geometry.index?.count > 0 && csas.solid.sides.other.triangles > 0")
+    watched.page.check("#compare")
+    watched.js("csas.solid.render()")
+    assert watched.js("csas.solid.further.object_3.map(mesh => mesh.visible)") == [True, False]
+    assert watched.page.locator("#tag-other").inner_text().endswith(": the target alone")
+
+
+def test_north_is_seen_where_its_line_lies_on_one_of_the_seabed(watched, serve, run_store):
+    watched.open(serve(run_store))
+    watched.js("csas.solid.look([0, 0, 0.2], 2), csas.solid.render()")
+    seen = watched.js("""(() => {
+        const s = csas.solid, line = s.sides.main.axes.children.filter(o => o.isLine).at(-1), p = line.geometry.attributes.position, V = s.camera.position.constructor;
+        const copy = document.createElement('canvas'); copy.width = s.canvas.width; copy.height = s.canvas.height;
+        const g = copy.getContext('2d'), light = [];
+        g.drawImage(s.canvas, 0, 0);
+        for (let i = 1; i < 20; i++) {
+            const at = new V().fromBufferAttribute(p, 0).lerp(new V().fromBufferAttribute(p, p.count - 1), i / 20).project(s.camera);
+            const d = g.getImageData((at.x + 1) / 2 * copy.width - 1.5, (1 - at.y) / 2 * copy.height - 1.5, 3, 3).data;
+            light.push(Math.max(...d.filter((_, j) => j % 4 === 1)));
+        }
+        return light; })()""")
+    assert min(seen) > 120, str(seen)  # beside the grid's 40; an edge of the carved volume crosses it
+
+
+def test_all_that_the_ruler_says_can_be_read(watched, serve, several):
+    watched.open(serve(read(several)))
+    watched.js("csas.setAspect(90)")
+    watched.settle()
+    watched.until("csas.loader.lines(csas.contourAddress('', csas.sameStamp('shadow_mask', csas.current)))")
+    for width, height in ((1366, 768), (1024, 768), (390, 844)):
+        watched.page.set_viewport_size({"width": width, "height": height})
+        for ends in ("[0, -0.35], [0, -0.8]", "[0, -0.8], [0, -0.35]", "[1, -0.4], [1, -0.9]"):
+            watched.js(f"csas.newRuler({ends}), csas.dirty()")
+            watched.drawn()
+            cut = watched.js("(e => e.scrollHeight - e.clientHeight)(document.querySelector('#measured'))")
+            assert cut <= 1, (width, watched.page.locator("#measured").inner_text())
+
+
+def test_the_printed_page_names_its_pictures_its_bookmarks_its_rulers_and_its_version(watched, serve, several):
+    watched.open(serve(read(several)))
+    page = watched.page
+    page.click("#bookmark")
+    watched.js("csas.newRuler([0, -0.35], [0, -0.8])")
+    watched.until("document.querySelectorAll('#bookmarks li').length + document.querySelectorAll('#rulers li').length === 2")
+    page.emulate_media(media="print")
+    for what in ("#panel-a select", "#panel-b select", "#bookmarks li button >> nth=0", "#rulers li button >> nth=0"):
+        assert page.locator(what).is_visible(), what
+        assert page.locator(what).evaluate("e => getComputedStyle(e).color") == "rgb(0, 0, 0)"
+    for what in ("#keep", "#bookmark", "#section", "#bookmarks .small"):
+        assert not page.locator(what).is_visible(), what
+    version = json.loads((several / "report.json").read_text())["versions"]["csas_shadow_ros"]
+    assert f"csas-shadow {version}" in page.locator("#facts").inner_text()
 
 
 def test_rulers_belong_to_their_aspect_have_ends_and_refuse_what_is_no_shadow(watched, serve, several):

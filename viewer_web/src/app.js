@@ -456,6 +456,9 @@ class App {
       $("where").textContent = `aspect ${view.aspect_deg.toFixed(1)}° · sonar bears ${bearing.toFixed(1).padStart(5, "0")}° · ${t}Z`;
     }
     this.say();
+    // Nothing is offered that there is nothing to make of.
+    $("save-circle").disabled = $("save-picture").disabled = !view;
+    $("report").disabled = !this.scene.contacts?.length;
     const shown = this.panels.map((p) => p.found?.about?.stamp ?? "").join();
     const all = this.panels.every((p) => p.found?.bitmap), late = this.panels.some((p) => p.found?.late || p.found?.partly);
     if (all && !this.stats.first) { this.stats.first = performance.now(); setTimeout(() => this.startSolid(), 50); }
@@ -506,7 +509,7 @@ class App {
     const [sx, sy, sz] = view.sonar, ra = Math.hypot(a[0] - sx, a[1] - sy), rb = Math.hypot(b[0] - sx, b[1] - sy);
     const off = Math.acos(Math.min(1, Math.max(-1, ((b[0] - a[0]) * (a[0] - sx) + (b[1] - a[1]) * (a[1] - sy)) / (distance * ra || 1)))) / RAD;
     if (!(distance > 0)) return { distance, why: "drag along a shadow, away from the sonar" };
-    if (off > ALONG_DEG) return { distance, why: `it runs ${off.toFixed(0)}° off the ray from the sonar, expected ${ALONG_DEG}° at most: along a shadow, away from the sonar` };
+    if (off > ALONG_DEG) return { distance, why: `it runs ${off.toFixed(0)}° off the ray from the sonar, expected ${ALONG_DEG}° at most` };
     const share = this.inShadow(view, a, b);
     if (share < IN_SHADOW) return { distance, why: `${Math.round(100 * share)} % of it lies in the segmented shadow, expected ${100 * IN_SHADOW} % or more` };
     const psi = Math.atan2(sz, rb), L = rb - ra;
@@ -611,16 +614,23 @@ class App {
       this.auto = { ...this.auto, [name]: auto };
       const row = $(`row-${name}`), label = METHODS[about.method] ?? about.method;
       // Further objects, and a second run's, stand at the threshold that they were measured at.
-      if (!row) return void this.surface(name, auto, performance.now());
+      if (!row) return void (this.sayWhose(), this.surface(name, auto, performance.now()));
       row.hidden = false;
       row.querySelector("label span").textContent = label;
       $(`tag-${name}`).textContent = label;
+      this.sayWhose();
       const input = $(`threshold-${name}`);
       input.max = about.method === "soft" ? 254 : 160;
-      const chosen = this.state.thresholds[about.method] ?? auto; // a threshold of another method means nothing
+      const chosen = this.codeOf(name);
       input.value = chosen;
       this.threshold(name, chosen);
     } catch { /* a newer volume has come, or the server is away: it is told again */ }
+  }
+
+  // The second method carves the target alone: no other contact stands beside it.
+  sayWhose() {
+    const { other } = this.volumes, further = Object.keys(this.volumes).some((name) => name.startsWith("object_"));
+    if (other) $("tag-other").textContent = `${METHODS[other.method] ?? other.method}${further ? ": the target alone" : ""}`;
   }
 
   dropVolume(name) {
@@ -640,13 +650,20 @@ class App {
     this.dimensions();
   }
 
+  // The threshold that a surface stands at, as a code: the slider knows it only in whole ones. One of another
+  // method means nothing.
+  codeOf(name) { return this.state.thresholds[this.volumes[name].method] ?? this.auto[name]; }
+
+  // Voxels somewhat above the threshold too: they are what another one would take in.
+  showEvidence(name, code) { this.solid.evidence(name, this.volumes[name], Math.min(254, code * 1.25)); }
+
   threshold(name, code) {
     const value = (code / 254) ** 2, row = $(`row-${name}`);
     const hard = this.volumes[name]?.method === "consensus" && code <= 1.5;
     row.querySelector("output").textContent = hard ? "hard carving" : value < 0.1 ? value.toFixed(4) : value.toFixed(3);
     row.querySelector("button").disabled = Math.abs(code - this.auto[name]) < 1e-9;
     this.surface(name, code, performance.now());
-    if (this.state.evidence && this.volumes[name]) this.solid.evidence(name, this.volumes[name], Math.min(254, code * 1.25));
+    if (this.state.evidence && this.volumes[name]) this.showEvidence(name, code);
     if (name !== "main" || this.loader.files) return;
     clearTimeout(this.exact);
     this.exact = setTimeout(() => this.measureAt(value), 300);
@@ -714,6 +731,7 @@ class App {
         tr.append(made);
       });
     };
+    $("why-here").hidden = !m?.object;
     if (!d && !m) return void row(["", c?.reason ?? (this.scene.volumes.main ? "carved; not measured yet" : this.scene.status || "nothing carved yet")]);
     row(["", "found, 95 %", ...(t ? ["truth"] : []), ...(m?.object ? ["surface here"] : []), ...(o ? ["run B", "B − A"] : [])], true);
     const deg = 1 / RAD, half = (one, key) => (one?.intervals?.[key] ? (one.intervals[key][1] - one.intervals[key][0]) / 2 : undefined);
@@ -737,7 +755,6 @@ class App {
       row(cells);
     }
     if (m && !m.object) row(["", "no object at this threshold"]);
-    $("why-here").hidden = !m?.object;
   }
 
   // Controls
@@ -760,7 +777,7 @@ class App {
     press("zoom-contact", () => this.zoomToContact());
     press("report", () => this.download("api/report.pdf?contact=" + encodeURIComponent(this.contact?.id ?? "")));
     press("save-circle", () => this.download(`api/circle.gif?contact=${encodeURIComponent(this.contact?.id ?? "")}&set=${this.panels[1].isView && !isOther(this.panels[1].layer) ? this.panels[1].layer : "shadow"}`));
-    check("evidence", () => { if (s.evidence) for (const n of Object.keys(this.volumes)) this.threshold(n, +$(`threshold-${n}`).value); });
+    check("evidence", () => { if (s.evidence) for (const name of ["main", "other"]) if (this.volumes[name]) this.showEvidence(name, this.codeOf(name)); });
     $("tag-other").hidden = !s.compare;
     $("whole").onchange = () => { this.solid?.whole($("whole").checked); if (!$("whole").checked) this.desk.goTo3d(); };
     press("play", () => this.play());

@@ -91,7 +91,7 @@ export class Desk {
 
   row(c, chosen) {
     const d = c.dimensions, judged = this.items[c.id]?.value.verdict;
-    const size = d ? `${d.length_m.toFixed(2)} × ${d.width_m.toFixed(2)} × ${d.height_m.toFixed(2)} m` : c.kind;
+    const size = d ? `${d.length_m.toFixed(2)} × ${d.width_m.toFixed(2)} × ${d.height_m.toFixed(2)} m` : c.reason ?? c.kind;
     const button = make("button", { type: "button", onclick: () => this.choose(c.id) }, make("b", { textContent: c.name }), make("span", { textContent: size }), make("span", { className: "judged", textContent: judged ?? "" }));
     button.dataset.contact = c.id;
     button.setAttribute("aria-pressed", String(chosen));
@@ -118,6 +118,7 @@ export class Desk {
     if (other) lines.push(`Run B (${other.title}) is moved by ${other.moved_m.toFixed(2)} m, so that its contact lies where the first run's does.${other.damage ? ` Its damage: ${other.damage}` : ""}`);
     for (const problem of this.app.scene.damage ? this.app.scene.damage.split("; ") : []) lines.push(`Damage: ${problem}.`);
     for (const problem of report?.problems ?? []) lines.push(`Damage: ${problem}.`);
+    if (report?.version) lines.push(`Made by csas-shadow ${report.version}.`);
     const text = lines.join("\n");
     if ($("facts").dataset.text === text) return;
     $("facts").dataset.text = text;

@@ -26,8 +26,11 @@ function seabedGrid() {
       const list = Number.isInteger(at) ? coarse : fine;
       list.push(at, x, 0, at, x + PIECE_M, 0, x, at, 0, x + PIECE_M, at, 0);
     }
-  const lines = (list, color) => new LineSegments(new BufferGeometry().setAttribute("position", new BufferAttribute(new Float32Array(list), 3)), new LineBasicMaterial({ color }));
-  return new Group().add(lines(fine, 0x222d35), lines(coarse, 0x3c4d59));
+  const lines = (list, color) => new LineSegments(new BufferGeometry().setAttribute("position", new BufferAttribute(new Float32Array(list), 3)), new LineBasicMaterial({ color, depthWrite: false }));
+  // Drawn first and without depth: an axis that lies on one of its lines is seen.
+  const grid = new Group();
+  grid.renderOrder = -1;
+  return grid.add(lines(fine, 0x222d35), lines(coarse, 0x3c4d59));
 }
 
 function boxLines(size) {
@@ -245,7 +248,11 @@ export class Solid {
         each.more.add(mesh);
         return mesh;
       });
-      for (const mesh of this.further[name]) fill(mesh, shape.faces.length ? shape : NONE);
+      this.further[name].forEach((mesh, i) => {
+        fill(mesh, shape.faces.length ? shape : NONE);
+        // The second method carves the target alone.
+        if (i && !ofSecond(name)) mesh.visible = false;
+      });
       this.place();
     }
     this.dirty();
