@@ -157,13 +157,15 @@ class BagRecorderNode(CsasNode):
             lock.close()
             raise BagError(f"{out} is being recorded by another process") from None
         self._lock = lock
-        # A killed recorder leaves the bag of its last run without an end: that one is gone on with.
+        # A killed recorder leaves the bag of its last run without an end: that one is gone on with. Or it was
+        # ended in the midst of that run, and is to go on: a node that begins anew at other ports is.
         last = out
         for number in range(2, _MOST_RUNS):
             if not _bag_of_run(out, number).exists():
                 break
             last = _bag_of_run(out, number)
-        path = out if last == out or (last / "metadata.yaml").exists() else last
+        goes_on = self.parameters.resume or not (last / "metadata.yaml").exists()
+        path = last if goes_on else out
         self._open_bag(path)
 
     def _open_bag(self, path: Path) -> RunBag:

@@ -457,6 +457,29 @@ def test_a_recorder_that_is_killed_while_it_takes_a_bag_over_loses_nothing_of_it
     assert sorted(path.name for path in tmp_path.glob("recording*")) == ["recording"]
 
 
+def test_a_recorder_that_begins_anew_goes_on_with_the_bag_of_its_last_run(
+    graph: Graph, run_bag: Path, tmp_path: Path
+) -> None:
+    first, last = tmp_path / "recording", tmp_path / "recording_2"
+    for path in (first, last):
+        shutil.copytree(run_bag, path)
+    (kept,), (left,) = first.glob("*.mcap"), last.glob("*.mcap")
+    before = kept.stat().st_ino, left.stat().st_ino
+    recorder = graph.add(BagRecorderNode, out=str(first), resume=True)
+    graph.executor.remove_node(recorder)
+    graph.nodes.remove(recorder)
+    recorder.stop()
+    recorder.destroy_node()
+    assert sorted(path.name for path in tmp_path.glob("recording*")) == ["recording", "recording_2"]
+    (left,) = last.glob("*.mcap")
+    assert kept.stat().st_ino == before[0], "what is whole is not written again"
+    assert left.stat().st_ino != before[1], "the last run's bag is"
+    found, whole = (
+        sorted((m.topic, bytes(m.cdr)) for m in BagReader(bag).messages()) for bag in (last, run_bag)
+    )
+    assert found == whole
+
+
 def test_an_unfinished_recording_that_cannot_be_read_is_kept_under_another_name(
     graph: Graph, tmp_path: Path
 ) -> None:
