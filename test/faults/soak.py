@@ -729,6 +729,8 @@ def two_graphs(bags: Bags, out: Path, circles: int, seed: int) -> list[str]:
 
     from csas_shadow_ros.graph.processes import DomainReservation
 
+    for scene in Bags.SCENES:
+        bags.hash_of(scene)  # both need them, and would make them at once
     with DomainReservation() as domain, ThreadPoolExecutor(2) as pool:
         told = []
         for number in range(2):
