@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csas_shadow_ros.core.errors import AdapterError, quoted
+from csas_shadow_ros.core.imaging.mask_codes import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 
 from .messages import MessageFactory, check_type, frame_of, make_header
 from .topics import IMAGE, MATTER_ENCODING, VOXEL_ENCODING, ImageStream, stream
@@ -305,7 +306,7 @@ def check_pixels(pixels: NDArray[Any], kind: ImageStream) -> None:
         return
     if content == "mask":
         _refuse(
-            ~np.isin(pixels, (0, 64, 128, 255)), pixels, where, "none of 0, 64, 128, 255", "0, 64, 128 or 255"
+            ~np.isin(pixels, tuple(_MASK)), pixels, where, "none of 0, 64, 128, 255", "0, 64, 128 or 255"
         )
         return
     if content == "matter":
@@ -335,7 +336,7 @@ def check_pixels(pixels: NDArray[Any], kind: ImageStream) -> None:
 
 
 #: The bytes that may be in a mask.
-_MASK = bytes((0, 64, 128, 255))
+_MASK = bytes((MASK_OUTSIDE, MASK_COVERED, MASK_UNKNOWN, MASK_SHADOW))
 
 
 def _plainly_fine(pixels: NDArray[Any], kind: ImageStream) -> bool:

@@ -22,15 +22,13 @@ from ..bags import BagReader, iterate_pairs
 from ..core.errors import CsasError, ParameterError
 from ..core.geometry import Datum, GroundGrid, View, ViewInfo
 from ..core.imaging.composites import Composites
+from ..core.imaging.mask_codes import MASK_SHADOW
 from ..core.parameters import PlaceParameters
 from ..core.shape.mesh import Dimensions
 from ..core.shape.result import Quality, Result
 from ..core.shape.volume import Volume, VoxelGrid
 from ..results.bag import ResultBag
 from ..results.layout import read_report
-
-#: What a mask says of a pixel in the target's shadow (docs/conventions.md).
-_SHADOW = 255
 
 
 class MapError(CsasError):
@@ -173,7 +171,7 @@ class MapSource:
         masks: dict[int, tuple[ViewInfo, NDArray[np.uint8]]] = {}
         for view in self._views(reader, "shadow_mask"):
             # Bits: hundreds of masks are kept until their views come.
-            masks[view.info.stamp_ns] = view.info, np.packbits(view.pixels == _SHADOW)
+            masks[view.info.stamp_ns] = view.info, np.packbits(view.pixels == MASK_SHADOW)
         if not masks:
             raise MapError(f"{ResultBag.FILE} of {self.folder} holds no shadow_mask views")
         grid = self._composite("multilook", "").grid

@@ -157,16 +157,15 @@ class BagRecorderNode(CsasNode):
             lock.close()
             raise BagError(f"{out} is being recorded by another process") from None
         self._lock = lock
-        # A killed recorder leaves the bag of its last run without an end: that one is gone on with. Or it was
-        # ended in the midst of that run, and is to go on: a node that begins anew at other ports is.
+        # A killed recorder leaves the bag of its last run without an end: its successor goes on with that. So
+        # does one with `resume`, whose predecessor ended in mid-run, as a node does that begins anew.
         last = out
         for number in range(2, _MOST_RUNS):
             if not _bag_of_run(out, number).exists():
                 break
             last = _bag_of_run(out, number)
         goes_on = self.parameters.resume or not (last / "metadata.yaml").exists()
-        path = last if goes_on else out
-        self._open_bag(path)
+        self._open_bag(last if goes_on else out)
 
     def _open_bag(self, path: Path) -> RunBag:
         cut = path.with_name(f"{path.name}.cut")

@@ -49,7 +49,7 @@ def test_a_process_whose_interpreter_stands_still_ends_with_its_stacks_in_the_lo
     assert not says_that_it_stood_still("[ERROR] Timeout (of something else)")
 
 
-def test_a_node_that_stands_still_in_a_callback_ends(domain: int) -> None:
+def test_a_node_that_stands_still_at_its_start_ends(domain: int) -> None:
     code, said, _ = ended(
         f"""
         import ctypes, functools, sys

@@ -56,8 +56,8 @@ def ends_if_it_stands_still(stands_still_s: float = STANDS_STILL_S) -> Iterator[
 
 def says_that_it_stood_still(log: str) -> bool:
     """Say whether a log ends with the stacks of a process that ended itself so."""
-    _, found, stacks = log.rpartition(f"\n{_HEADER}")
-    if not found and not log.startswith(_HEADER):
-        return False
-    lines = (stacks if found else log).splitlines()[1:]
-    return all(not line or line.startswith(("Thread ", "Current thread ", "  ")) for line in lines)
+    _, found, stacks = f"\n{log}".rpartition(f"\n{_HEADER}")
+    frames = stacks.splitlines()[1:]
+    return bool(found) and all(
+        not line or line.startswith(("Thread ", "Current thread ", "  ")) for line in frames
+    )
