@@ -676,7 +676,20 @@ def _sinks_complete(graph: Graph, watcher: _Watcher) -> bool:
             return False
     if "bag_recorder" not in graph.processes:
         return True
-    return watcher.recorded(recorded_streams(graph.parameters["bag_recorder"].get("topics", "all")))
+    return watcher.recorded(recorded_streams(_topics_recorded(graph)))
+
+
+def _not_held(graph: Graph, watcher: _Watcher, stage: str, messages: set[str]) -> set[str]:
+    """Return what the running recorder has yet to get of what is said once."""
+    from ..nodes.playing import recorded_streams
+
+    if "bag_recorder" not in graph.processes or watcher.unable("bag_recorder"):
+        return set()
+    if not recorded_streams(_topics_recorded(graph)):
+        return set()  # without a stream it has no heartbeat
+    beats = [beat for (node, _), beat in watcher.beats.items() if node == "bag_recorder"]
+    held = {topic for beat in beats for topic in beat.values.get("holds", "").split()}
+    return _said_once(stage, messages, _topics_recorded(graph)) - held
 
 
 def _error_of(node: str, text: str) -> CsasError:
@@ -714,12 +727,12 @@ def _collect(
             if not further <= set(got):
                 wanted |= further
                 continue
-            beats = [b for (node, _), b in watcher.beats.items() if node == "bag_recorder"]
-            held = max((b.counts.get("result_topics", 0) for b in beats), default=len(further))
-            if held >= len(further) or watcher.unable("bag_recorder"):
+            # A message may be on its way to the recorder for seconds, where the middleware lost a part of it.
+            late = sorted(_not_held(graph, watcher, stage, wanted))
+            if not late:
                 return got
             if time.monotonic() - since > _COLLECT_S:
-                tell(f"the recording holds {held} of the {len(further)} topics of the result")
+                tell(f"the recording holds nothing of {', '.join(late)}")
                 return got
         watcher.spin(0.01)
         graph.watch()
@@ -744,9 +757,23 @@ def _finish_recording(
     published = watcher.published(_STAGES_BEFORE)
     unable = watcher.unable("bag_recorder")
     graph.stop()
-    topics = graph.parameters["bag_recorder"].get("topics", "all")
+    topics = _topics_recorded(graph)
     lacking = _not_recorded(recording, topics, result, published, messages)
     return [unable, *lacking] if unable else lacking
+
+
+def _topics_recorded(graph: Graph) -> str:
+    """Return the recorder's parameter."""
+    return str(graph.parameters["bag_recorder"].get("topics", "all"))
+
+
+def _said_once(stage: str, messages: set[str], topics: str) -> set[str]:
+    """Return the latched topics that a recorder of these topics has to hold of a run."""
+    from ..nodes.playing import topics_to_record
+
+    inputs = {"image": {"image", "camera_info", "track"}, "sector": {"track"}}.get(stage, set())
+    once = inputs | messages
+    return once if topics == "all" else once & set(topics_to_record(topics))
 
 
 def _not_recorded(
@@ -754,7 +781,7 @@ def _not_recorded(
 ) -> list[str]:
     """Hold a recording against what was published; one line for each topic or stream that is not whole."""
     from ..bags import BagReader
-    from ..nodes.playing import recorded_streams, topics_to_record
+    from ..nodes.playing import recorded_streams
 
     try:
         reader = BagReader(recording)
@@ -765,10 +792,8 @@ def _not_recorded(
         found = reader.topic(topic)
         return found.count if found is not None else 0
 
-    expected = {"image": {"image", "camera_info", "track"}, "sector": {"track"}}.get(result.stage, set())
-    named = None if topics == "all" else set(topics_to_record(topics))
-    once = sorted(t for t in expected | messages if named is None or t in named)
-    lacking = [topic for topic in once if not count(topic)]
+    once = _said_once(result.stage, messages, topics)
+    lacking = [topic for topic in sorted(once) if not count(topic)]
     lines = [f"nothing of {', '.join(lacking)}"] if lacking else []
     kept = recorded_streams(topics)
     for name in published:

@@ -19,12 +19,12 @@ from csas_shadow_ros.core.errors import BagError, ParameterError
 from csas_shadow_ros.core.geometry.runs import TrackBook
 from csas_shadow_ros.durable import sync_tree
 from msg_adapters import STREAMS, TOPICS, message_from_cdr, track_piece_from_msg
-from msg_adapters.topics import RESULT_TOPICS, absolute_name, is_latched, is_topic, split_prefix
+from msg_adapters.topics import absolute_name, is_latched, is_topic, split_prefix
 from msg_adapters.topics import topic as topic_of
 
 from . import qos
 from .playing import message_stamp, recorded_streams, topics_to_record
-from .runtime.base import INTEGRATED, CsasNode, Inlet, run_node
+from .runtime.base import INTEGRATED, CsasNode, Inlet, Latched, run_node
 from .runtime.runs import HOLD_S
 
 #: Topics of messages that differ though they carry the same stamp.
@@ -55,10 +55,6 @@ def _unused(cut: Path, kind: str) -> Path:
 def _bag_of_run(out: Path, number: int) -> Path:
     """Return the bag of the second, third, … run."""
     return out.with_name(f"{out.name}_{number}")
-
-
-def _latched_profile(topic: str) -> Any:
-    return qos.TRACK if topic == "track" else qos.LATCHED
 
 
 class RecordingInlet(Inlet):
@@ -99,8 +95,8 @@ class RunBag:
     run_ns: int | None = None
     #: What is in it: (topic, stamp, checksum where messages of a stamp may differ).
     seen: set[tuple[str, int, int]] = field(default_factory=set)
-    #: Topics of a result that it has messages of.
-    results: set[str] = field(default_factory=set)
+    #: Latched topics that it has messages of.
+    latched: set[str] = field(default_factory=set)
 
 
 class BagRecorderNode(CsasNode):
@@ -135,7 +131,7 @@ class BagRecorderNode(CsasNode):
         self._flushed_s = 0.0
         #: Topics of which something was not taken for want of space, and the latched topics' subscriptions.
         self._dropped: set[str] = set()
-        self._latched: dict[str, Any] = {}
+        self._by_topic: dict[str, Latched] = {}
         self._largest = 0
         self._broken = False
         self._open(Path(p.out))
@@ -322,11 +318,9 @@ class BagRecorderNode(CsasNode):
             return
         if shutil.disk_usage(self._bags[-1].path).free > 2 * _RESERVE + self._largest:
             self.cannot("")
-            for topic in self._dropped & set(self._latched):
+            for topic in self._dropped & set(self._by_topic):
                 # Views are sent again; of these whoever subscribes anew gets the last.
-                self.unsubscribe(self._latched[topic])
-                profile = _latched_profile(topic)
-                self._latched[topic] = self.subscribe(topic, profile, self._taker(topic), raw=True)
+                self._by_topic[topic].ask_again()
             self._dropped.clear()
 
     def _failed(self, error: BagError) -> None:
@@ -357,9 +351,8 @@ class BagRecorderNode(CsasNode):
         self._recorded.add(topic)
         take = self._taker(topic)
         if is_latched(topic):
-            self._latched[topic] = self.subscribe_latched(
-                topic, take, raw=True, profile=_latched_profile(topic)
-            )
+            profile = qos.TRACK if topic == "track" else qos.LATCHED
+            self._by_topic[topic] = self.subscribe_latched(topic, take, raw=True, profile=profile)
         else:
             self.subscribe(topic, qos.UNLATCHED if topic in _NEVER_ALIKE else qos.VIEWS, take, raw=True)
 
@@ -385,8 +378,8 @@ class BagRecorderNode(CsasNode):
                 self._failed(error)
                 return
             self.counts["written"] += 1
-            if split_prefix(topic)[1] in RESULT_TOPICS:
-                bag.results.add(topic)
+            if latched:
+                bag.latched.add(topic)
             if topic not in _NEVER_ALIKE:
                 bag.seen.add(key)
         if flow is not None and stamp is not None:
@@ -413,17 +406,13 @@ class BagRecorderNode(CsasNode):
                 inlet.report_taken_over()
 
     def state_values(self) -> dict[str, str]:
-        """Return the recorded run and its bag."""
+        """Return the recorded run, its bag, and the latched topics that this has messages of."""
         if not self._bags:
             return {}
         bag = self._bags[-1]
-        return {"bag": str(bag.path)} | ({} if bag.run_ns is None else {"run": str(bag.run_ns)})
-
-    def state_counts(self) -> dict[str, int]:
-        """Count the topics of a result with messages in the newest bag."""
-        # Heartbeats ask from a thread of their own: a length can be read while the set grows.
-        bags = self._bags[-1:]
-        return {"result_topics": len(bags[0].results) if bags else 0}
+        # Heartbeats ask from a thread of their own, while the set grows: it is copied in one step.
+        values = {"bag": str(bag.path), "holds": " ".join(sorted(tuple(bag.latched)))}
+        return values | ({} if bag.run_ns is None else {"run": str(bag.run_ns)})
 
     def tick(self) -> None:
         """Flush the bag against a crash; record further objects' topics as they appear."""

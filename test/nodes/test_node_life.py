@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -10,7 +11,9 @@ import pytest
 pytest.importorskip("rclpy")
 
 import rclpy
+from graph_of_nodes import STEP_DEG, VOXEL_M
 from rclpy.context import Context
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
 from csas_shadow_ros.nodes import qos
@@ -71,6 +74,23 @@ def test_parameters_that_belong_together_may_be_set_one_by_one(graph: Graph) -> 
     assert node.set_parameters([Parameter("origin_lon_deg", value=-4.5)])[0].successful
     assert node.start(), node.error
     assert math.isnan(node.parameters.origin_heading_deg)
+
+
+def test_what_was_latched_while_a_node_was_inactive_reaches_it_once_it_is_active(
+    graph: Graph, run_bag: Path
+) -> None:
+    """A lifecycle manager may activate the player first: nobody publishes the image a second time."""
+    node = SubApertureNode(context=graph.context, overrides={"step_deg": STEP_DEG, "min_sinks": 1})
+    graph.nodes.append(node)
+    graph.executor.add_node(node)
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    graph.add(BagPlayerNode, bag=str(run_bag))
+    came = {"image", "camera_info", "track"}
+    graph.spin_until(lambda: came <= node._missed, what="all of it comes to the inactive node")
+    assert node.run is None
+    graph.add(VoxelCarverNode, voxel_size_m=VOXEL_M)
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    graph.spin_until(lambda: node.run is not None, what="it has the image and its track")
 
 
 def test_publishers_that_are_heard_are_not_warned_of(

@@ -7,7 +7,9 @@ import os
 import resource
 import signal
 import subprocess
+import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -232,4 +234,37 @@ def test_a_node_killed_between_the_last_view_and_the_collection_of_the_result_co
     assert_same_grid(result, reference)
     assert result.composites["multilook"].any()
     assert result.lost == 0
+    assert result.not_recorded == []
+
+
+def test_a_replay_waits_until_its_recording_holds_what_is_said_once(
+    run_bag: Path, tmp_path: Path, graphs: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The middleware may bring a latched message seconds after views, if it lost a part of it."""
+    collect = module._collect
+    waited: list[set[str]] = []
+
+    def late(graph: Any, watcher: Any, *more: Any) -> Any:
+        began = time.monotonic()
+        real = module._not_held
+
+        def not_held(*args: Any) -> set[str]:
+            # What the recorder says is held back for a second, and then let through.
+            if time.monotonic() - began < 1.0:
+                for key, beat in watcher.beats.items():
+                    if key[0] == "bag_recorder":
+                        holds = set(beat.values["holds"].split()) - {"camera_info"}
+                        watcher.beats[key] = replace(
+                            beat, values={**beat.values, "holds": " ".join(sorted(holds))}
+                        )
+            waited.append(real(*args))
+            return waited[-1]
+
+        monkeypatch.setattr(module, "_not_held", not_held)
+        return collect(graph, watcher, *more)
+
+    monkeypatch.setattr(module, "_collect", late)
+    result = replay(run_bag, tmp_path, PARAMETERS, record=True, composites=False, progress=False)
+    assert {"camera_info"} in waited
+    assert waited[-1] == set()
     assert result.not_recorded == []

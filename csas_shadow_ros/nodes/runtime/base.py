@@ -163,7 +163,9 @@ class CsasNode(LifecycleNode):
         self.inlets: list[Inlet] = []
         self.sources: list[Source] = []
         self._owned: list[tuple[Callable[[Any], Any], Any]] = []
-        self._unlatched: list[Unlatched] = []
+        self._latched: list[Latched] = []
+        #: Topics of which something came that was not taken: the node was inactive, or a rival was there.
+        self._missed: set[str] = set()
         #: Publishers of our topics of which nothing can be heard.
         self.strangers = Strangers(self)
         self._logged: dict[str, tuple[float, int]] = {}
@@ -236,6 +238,8 @@ class CsasNode(LifecycleNode):
         def guarded(msg: Any) -> None:
             if self.active and (not self.rival or topic == "progress"):
                 self.guard(topic, callback, msg)
+            else:
+                self._missed.add(topic)
 
         kind = self.messages.cls(topic_of(topic).type_name)
         # Not rclpy's own warnings: of two subscriptions to a topic one may hear what the other cannot.
@@ -260,20 +264,27 @@ class CsasNode(LifecycleNode):
         *,
         raw: bool = False,
         profile: Any = qos.LATCHED,
-    ) -> Subscription:
+    ) -> Latched:
         """Subscribe to a latched topic, whether or not its publisher really latches it."""
-        made = self.subscribe(topic, profile, callback, raw=raw)
-        if not self._unlatched:
+        if not self._latched:
             # One timer for all topics: a recorder follows dozens.
             self.every(_DURABILITY_S, self._look_for_unlatched)
-        self._unlatched.append(
-            Unlatched(self, topic, lambda profile: self.subscribe(topic, profile, callback, raw=raw))
+        made = Latched(
+            self, topic, profile, lambda profile: self.subscribe(topic, profile, callback, raw=raw)
         )
+        self._latched.append(made)
         return made
 
     def _look_for_unlatched(self) -> None:
-        for one in self._unlatched:
+        for one in self._latched:
             one.look()
+
+    def _ask_for_missed(self) -> None:
+        """Get again what was latched while the node took nothing: nobody publishes it a second time."""
+        missed, self._missed = self._missed, set()
+        for one in self._latched:
+            if one.topic in missed:
+                one.ask_again()
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call back periodically while the node is configured.
@@ -327,6 +338,8 @@ class CsasNode(LifecycleNode):
             self.rival = ""
             if not self.keeps_its_state():
                 self._begin_anew()
+            elif self.active:
+                self._ask_for_missed()
 
     def _begin_anew(self) -> None:
         def again() -> None:
@@ -518,6 +531,7 @@ class CsasNode(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start working."""
         self.active = True
+        self._ask_for_missed()
         self._beat_stop.clear()
         self._beat_thread = threading.Thread(target=self._beat_on, name="heartbeat", daemon=True)
         self._send_beats()
@@ -566,7 +580,8 @@ class CsasNode(LifecycleNode):
     def _destroy_owned(self) -> None:
         self.inlets.clear()
         self.sources.clear()
-        self._unlatched.clear()
+        self._latched.clear()
+        self._missed.clear()
         self._takes.clear()
         self._gives.clear()
         self.strangers.clear()
@@ -653,13 +668,13 @@ def _latches(publisher: TopicEndpointInfo) -> bool:
     )
 
 
-class Unlatched:
-    """A second subscription to a latched topic, for publishers that do not latch it.
+class Latched:
+    """The subscriptions to a latched topic: one of its own, and one for publishers that do not latch it.
 
     Such publishers do not match the first one, and those that latch match both: what they publish would come
-    twice, an image of hundreds of megabytes too. It is there as long as nobody publishes, or somebody who
-    does not latch. Where one of those is best effort it is so too: each message of these topics is whole by
-    itself, and what is lost on the way leaves what was there before.
+    twice, an image of hundreds of megabytes too. The second is there as long as nobody publishes, or somebody
+    who does not latch. Where one of those is best effort it is so too: each message of these topics is whole
+    by itself, and what is lost on the way leaves what was there before.
 
     Parameters
     ----------
@@ -667,27 +682,38 @@ class Unlatched:
         The node.
     topic : str
         Name of the topic.
+    profile : QoSProfile
+        That of the first subscription.
     subscribe : callable
-        Makes the subscription, of a quality of service.
+        Makes a subscription, of a quality of service.
     """
 
-    def __init__(self, node: CsasNode, topic: str, subscribe: Callable[[Any], Subscription]) -> None:
+    def __init__(
+        self, node: CsasNode, topic: str, profile: Any, subscribe: Callable[[Any], Subscription]
+    ) -> None:
         self._node = node
-        self._topic = topic
+        self.topic = topic
+        self._latched = profile
         self._subscribe = subscribe
         self._publishers = 0
         self._asked_s = time.monotonic()
         self._profile = qos.UNLATCHED
+        self._first = subscribe(profile)
         self.subscription: Subscription | None = subscribe(self._profile)
+
+    def ask_again(self) -> None:
+        """Subscribe anew: whoever does gets what is latched."""
+        self._node.unsubscribe(self._first)
+        self._first = self._subscribe(self._latched)
 
     def look(self) -> None:
         """Subscribe or unsubscribe as publishers come and go."""
-        count, now = self._node.count_publishers(self._topic), time.monotonic()
+        count, now = self._node.count_publishers(self.topic), time.monotonic()
         # Who they are takes longer to ask than how many; one may have taken another's place.
         if count == self._publishers and now - self._asked_s < _WHO_S:
             return
         self._publishers, self._asked_s = count, now
-        name = self._node.resolve_topic_name(self._topic)
+        name = self._node.resolve_topic_name(self.topic)
         publishers = self._node.get_publishers_info_by_topic(name)
         plain = [p for p in publishers if not _latches(p)]
         lossy = [p for p in plain if p.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT]
