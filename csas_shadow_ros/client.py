@@ -517,4 +517,4 @@ def spin(node: Any, timeout_s: float | None = None) -> None:
             signal.signal(number, handler)
 
 
-__all__ = ["ViewSubscriber", "create_node", "spin"]
+__all__ = ["Reach", "ViewSubscriber", "create_node", "spin"]

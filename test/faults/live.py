@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import json
 import os
 import random
@@ -28,6 +29,7 @@ from rclpy.executors import SingleThreadedExecutor
 from soak import STEP_DEG, STREAMS, VOXEL_M, Bags, hash_of
 
 from csas_shadow_ros.bags import read_run
+from csas_shadow_ros.client import Reach, create_node
 from csas_shadow_ros.core.geometry import Track
 from csas_shadow_ros.graph.processes import (
     DomainReservation,
@@ -68,20 +70,26 @@ class Vehicle:
     """Publishes what an outside processor would, and listens to what the graph leaves."""
 
     def __init__(self, graph: Graph, domain: int, namespace: str) -> None:
-        self.graph = graph
-        self.context = Context()
-        own = {k: v for k, v in graph.environment.items() if k.startswith(("ROS_", "FAST"))}
-        with environment_of(own):
-            rclpy.init(context=self.context, domain_id=domain)
-            self.node = rclpy.create_node("vehicle", context=self.context, namespace=namespace)
-        self.publishers = {
-            name: self.node.create_publisher(self._kind(name), name, qos.LATCHED)
-            for name in ("image", "camera_info", "track")
-        }
+        self._where = {k: v for k, v in graph.environment.items() if k.startswith(("ROS_", "FAST"))}, domain
+        self._namespace = namespace
         self.latest: dict[str, Any] = {}
         #: Hash of the grid, and views used, of each run that was published as final.
         self.final: dict[int | None, tuple[str, int]] = {}
         self.lost: dict[str, int] = {}
+        self._sent: dict[str, Any] = {}
+        self._begin()
+
+    def _begin(self) -> None:
+        self.context = Context()
+        own, domain = self._where
+        with environment_of(own):
+            rclpy.init(context=self.context, domain_id=domain)
+            self.node = create_node("vehicle", context=self.context, namespace=self._namespace)
+        self.reach = Reach()
+        self.publishers = {
+            name: self.node.create_publisher(self._kind(name), name, qos.LATCHED)
+            for name in ("image", "camera_info", "track")
+        }
         for name in ("voxel_grid/image", "voxel_grid/camera_info", "measurements"):
             self.node.create_subscription(self._kind(name), name, partial(self._take, name), qos.LATCHED)
         kind = MESSAGES.cls(TOPICS["progress"].type_name)
@@ -112,11 +120,25 @@ class Vehicle:
         """Publish a bag's run as one that was sailed later; return its name."""
         track = Track(bag.require_track().stamps_ns + by_ns, bag.require_track().positions_m)
         image = bag.coherent_image()
-        self.publishers["track"].publish(track_to_msg(MESSAGES, track))
         picture, info = coherent_image_to_msgs(MESSAGES, replace(image, stamp_ns=image.stamp_ns + by_ns))
-        self.publishers["camera_info"].publish(info)
-        self.publishers["image"].publish(picture)
+        self._sent = {"track": track_to_msg(MESSAGES, track), "camera_info": info, "image": picture}
+        self._say()
         return int(track.stamps_ns[0])
+
+    def _say(self) -> None:
+        for name, message in self._sent.items():
+            self.publishers[name].publish(message)
+
+    def begins_anew(self) -> bool:
+        """Begin again at other ports where others do not reach it, as a program from outside is told to."""
+        if not self.reach.is_lost():
+            return False
+        self.close()
+        gc.collect()  # nodes hold their participant until they are collected
+        self.reach.take_others()
+        self._begin()
+        self._say()
+        return True
 
     def close(self) -> None:
         """Go."""
@@ -161,7 +183,7 @@ class Voyage:
         self.rng = random.Random(given.seed)
         self.bags = Bags(given.bags)
         self.runs = [(scene, read_run(self.bags.path(scene))) for scene in Bags.SCENES[:3]]
-        self.line: dict[str, Any] = {"kills": [], "faults": [], "circle_s": [], "grids": 0}
+        self.line: dict[str, Any] = {"kills": [], "faults": [], "circle_s": [], "grids": 0, "anew": 0}
         self.memory: dict[str, list[int]] = {}
         self.kills_left = given.kills if given.kills >= 0 else self.rng.randint(2, 6)
         self.circle = 0
@@ -201,6 +223,7 @@ class Voyage:
         """Start again what died, and take what came."""
         self.graph.watch()
         self.vehicle.executor.spin_once(timeout_sec=0.05)
+        self.line["anew"] += self.vehicle.begins_anew()
 
     def _sail_circle(self) -> bool:
         """Send a run, kill while it is worked on, and hold its grid against the bag's; False if it hung."""

@@ -30,7 +30,9 @@ from csas_shadow_ros.core.errors import ParameterError
 from csas_shadow_ros.graph.processes import DomainReservation, Graph, graph_environment, start_fork_server
 from csas_shadow_ros.graph.replay import replay
 from csas_shadow_ros.nodes import qos
+from csas_shadow_ros.nodes.runtime import hearing
 from csas_shadow_ros.nodes.runtime.shared_memory import owned_files
+from csas_shadow_ros.nodes.sub_aperture import SubApertureNode
 from msg_adapters import Heartbeat, RclpyMessages, measurements_from_msg, progress_from_msg
 from msg_adapters.topics import TOPICS
 
@@ -409,6 +411,38 @@ def test_a_node_that_was_killed_comes_back_at_ports_that_nobody_writes_to(graph:
             process.kill()
     assert len(taken[0]) == len(taken[1]) == 2
     assert not taken[0] & taken[1]
+
+
+def test_a_node_that_waits_names_a_process_whose_port_another_has_replaced(
+    graph: Graph, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What such a process latches reaches nobody that begins later, and nothing else says why."""
+    monkeypatch.setattr(hearing, "_DEAF_LOOK_S", 0.5)
+    told: list[str] = []
+    kind = RclpyMessages().cls(TOPICS["/diagnostics"].type_name)
+    listener = graph.plain_node("listener")
+    listener.create_subscription(
+        kind, "/diagnostics", lambda msg: told.append(msg.status[0].message), qos.DIAGNOSTICS
+    )
+    graph.add(SubApertureNode)
+    environment = graph_environment(graph.domain_id, tmp_path)
+    with subprocess.Popen(
+        [sys.executable, "-c", WAITS], env=environment, stdout=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "there\n"
+            graph.spin_until(lambda: len(told) > 3)
+            assert set(told) == {"waiting for image and track"}
+            ports = {name for name in owned_files(process.pid) if "_port" in name}
+            for port in ports:
+                Path(port).unlink()
+                Path(port).write_bytes(bytes(4096))
+            graph.spin_until(lambda: f"process {process.pid} (" in told[-1])
+            assert told[-1].endswith("in shared memory that it reads; start it again")
+        finally:
+            process.kill()
+    graph.spin_until(lambda: told[-1] == "waiting for image and track", what="it is gone")
 
 
 def test_a_subscriber_that_hears_nobody_says_so_and_is_not_waited_for(

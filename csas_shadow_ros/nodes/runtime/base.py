@@ -68,7 +68,7 @@ from msg_adapters.topics import topic as topic_of
 
 from .. import qos
 from .flow import Flow
-from .hearing import Reach, make_hearing
+from .hearing import Deaf, Reach, make_hearing
 from .host import Host
 from .params import DYNAMIC, NODES, declare, from_overrides
 from .rivals import Rivals
@@ -168,6 +168,7 @@ class CsasNode(LifecycleNode):
         self._missed: set[str] = set()
         #: Publishers of our topics of which nothing can be heard.
         self.strangers = Strangers(self)
+        self._deaf = Deaf(self.context.get_domain_id())
         self._logged: dict[str, tuple[float, int]] = {}
         self._rates: dict[str, tuple[int, float]] = {}
         self._beat_lock = threading.Lock()
@@ -479,6 +480,9 @@ class CsasNode(LifecycleNode):
         for source in self.sources:
             values |= {f"{source.stream} {k}": str(v) for k, v in source.counts().items()}
         waiting, unheard = self.waiting(), list(self.strangers.unheard.values())
+        if waiting and (deaf := self._deaf.look()):
+            self.log_throttled("deaf", deaf, "warn")
+            waiting = f"{waiting}; {deaf}"
         values |= {f"not heard {n}": text for n, text in enumerate(unheard, 1)}
         if self.trouble or self.unable:
             level, text = Level.ERROR, self.trouble or self.unable

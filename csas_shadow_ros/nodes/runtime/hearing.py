@@ -7,8 +7,9 @@ Three things leave one so:
   process had not begun to listen. Such a port is not taken (`avoid_dead_ports`).
 - Another process still holds a port's lock, and the middleware goes on without that port: the participant is
   made again (`make_hearing`).
-- Another process replaces the port of one that is alive, but had no processor for long. `Reach` looks for it,
-  as for what two processes that begin at once do to one another; the node begins anew at other ports.
+- Another process replaces the port of one that is alive, but had no processor for long, or a process was
+  killed while it wrote there. `Reach` looks for it, as for what two processes that begin at once do to one
+  another; the node begins anew at other ports. Of a program from outside that does not, `Deaf` tells.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from textwrap import shorten
 from typing import IO, Any, TypeVar
 
-from .shared_memory import bound, owned_files, remove_unmade_ports
+from .shared_memory import bound, owned_files, ports_of, remove_unmade_ports
 
 Made = TypeVar("Made")
 
@@ -46,6 +48,9 @@ _PATIENCE_S, _AGAIN_S = 10.0, 0.2
 #: within twice `healthy_check_timeout_ms` and a second. How often (s) to look whether its own are still those
 #: that others find.
 _LOOKS_S, _OWN_LOOK_S = (8.0, 11.0), 5.0
+#: How often (s) a node that waits looks for others that hear nobody. The graph's own find it out within half
+#: of that and begin anew: who is so twice in a row is somebody else.
+_DEAF_LOOK_S = 10.0
 #: What keeps ports from this process' next participant, for as long as the process lives: port → its holders.
 _kept: dict[str, list[Any]] = {}
 
@@ -74,11 +79,24 @@ def _number(port: str) -> int:
 
 
 class Reach:
-    """Whether others reach this process at the ports that it has made.
+    """Whether others reach this process at the ports that it has made; make it once these are there.
 
     A file that is replaced is let go of when the middleware finds that nobody reads it. It is looked for
-    twice, later than that. Another process may also replace the port of one that is alive but has had no
-    processor for as long as the middleware waits for a sign of it (`healthy_check_timeout_ms`).
+    twice, later than that. Another process may also replace the port of one that is alive: it has had no
+    processor for as long as the middleware waits for a sign of it (`healthy_check_timeout_ms`), or a process
+    was killed while it wrote there.
+
+    Examples
+    --------
+    >>> import rclpy
+    >>> from csas_shadow_ros.client import Reach, create_node
+    >>> rclpy.init()
+    >>> node = create_node("sonar", namespace="csas")
+    >>> reach = Reach()
+    >>> reach.is_lost()  # ask now and then, every second or so; if so, end the process and start it again
+    False
+    >>> node.destroy_node()
+    >>> rclpy.shutdown()
     """
 
     def __init__(self) -> None:
@@ -119,6 +137,54 @@ class Reach:
             with contextlib.suppress(OSError):
                 holders.append(Path(port + _OWNER).open("ab"))  # noqa: SIM115 (held for good)
                 fcntl.flock(holders[-1], fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+class Deaf:
+    """Other processes of a domain that hear nobody, as another has replaced the port that they read.
+
+    A program from outside the graph, such as a sonar's, does not find it out: what it latches never reaches a
+    node that has begun since, and nothing says why.
+
+    Parameters
+    ----------
+    domain_id : int
+        ROS domain.
+    """
+
+    def __init__(self, domain_id: int) -> None:
+        self._range = ports_of(domain_id)
+        self._look_s = -math.inf
+        self._before: set[int] = set()
+        self._told = ""
+
+    def look(self) -> str:
+        """Name those that were so the last time as well; empty if there are none."""
+        now_s = time.monotonic()
+        if now_s - self._look_s < _DEAF_LOOK_S:
+            return self._told
+        self._look_s = now_s
+        found = {int(maps.parent.name) for maps in Path("/proc").glob("[0-9]*/maps") if self._is_deaf(maps)}
+        named = ", ".join(f"process {pid} ({_command(pid)})" for pid in sorted(found & self._before))
+        self._before = found
+        self._told = named and (
+            f"{named} hears nobody: another process has replaced a port in shared memory that it reads;"
+            " start it again"
+        )
+        return self._told
+
+    def _is_deaf(self, maps: Path) -> bool:
+        if not (replaced := _open_in(maps, _DELETED)):
+            return False
+        own = {file for file in owned_files(maps.parent.name) if "_port" in file}
+        return bool(replaced & own) and any(_number(port) in self._range for port in own)
+
+
+def _command(pid: int) -> str:
+    """Return how a process was called, in a few words."""
+    with contextlib.suppress(OSError):
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
+        return shorten(" ".join(words), 60, placeholder=" …")
+    return "ended"
 
 
 def _locked(port: str) -> IO[bytes] | None:
