@@ -666,7 +666,8 @@ def live_child(mark: str, bags: Bags, folder: Path, seed: int, *more: str) -> di
             stderr=log,
             text=True,
         )
-    lines = [json.loads(line) for line in child.stdout or ()]
+    # The middleware writes lines of its own there.
+    lines = [json.loads(line) for line in child.stdout or () if line.startswith("{")]
     child.wait()
     left = [f"process {name_of(pid) or pid} is left" for pid in marked(mark)]
     if not lines or child.returncode:
