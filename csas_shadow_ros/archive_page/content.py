@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..archive.catalogue import RUNS
 from ..archive.find import Found
@@ -164,7 +165,7 @@ def _drawn(path: Path) -> bytes:
 
     from ..maps.source import read_grid
 
-    picture = np.full((_SIDE, _SIDE, 3), 24, np.uint8)
+    picture: NDArray[np.uint8] = np.full((_SIDE, _SIDE, 3), 24, np.uint8)
     try:
         grid, _ = read_grid(path)
     except CsasError:

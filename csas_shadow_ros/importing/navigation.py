@@ -85,7 +85,7 @@ def read_track(settings: Settings, datum: Datum | None, file: Path | None = None
         poses = _of_csv(path, settings, axes)
     if not poses.stamps_ns:
         raise ImportSettingsError(f"{path} holds no pose")
-    places = np.array(poses.places, dtype=np.float64).reshape(-1, 3)
+    places: FloatArray = np.array(poses.places, dtype=np.float64).reshape(-1, 3)
     if settings.has("track", "lever_arm_m"):
         places = places + _lever_arms(poses, settings, path)
     positions = (

@@ -48,7 +48,7 @@ _REDUCED_DEG = 4.0
 #: More triangles than this are drawn from a coarser surface.
 _MAX_FACES = 30_000
 _GREEN = "#1fd655"
-_STYLE: dict[str, Any] = {
+_STYLE: Any = {
     "font.size": 11.0,
     "axes.titlesize": 12.0,
     "axes.labelsize": 11.0,
@@ -82,7 +82,7 @@ def draw_all(subject: Subject, folder: Path) -> tuple[list[str], dict[str, str],
     """
     folder.mkdir(parents=True, exist_ok=True)
     files, left_out, failed = [], {}, {}
-    with mpl.rc_context(_STYLE):  # type: ignore[arg-type]
+    with mpl.rc_context(_STYLE):
         for name, draw in FIGURES.items():
             path = folder / f"{name}.png"
             try:

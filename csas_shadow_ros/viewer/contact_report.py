@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..core.imaging.mask_codes import MASK_SHADOW
 from ..core.shape.mesh import mesh_from_grid
-from .contacts import axis_bearing_deg
+from .contacts import axis_bearing_deg, north_shown_deg
 from .crop import HIGH_SHOWN_DB as _HIGH
 from .crop import LOW_SHOWN_DB as _LOW
 from .crop import Window, cast, colours_of, contact_named, grey_of, outlines, shadow_m, to_north
@@ -39,7 +39,7 @@ from .store import Entry, ViewStore
 _PAGE = (8.27, 11.69)
 #: Its margins, shares of its width.
 _LEFT, _RIGHT = 0.07, 0.93
-_STYLE: dict[str, Any] = {"font.size": 8.5, "pdf.fonttype": 42, "axes.linewidth": 0.6}
+_STYLE: Any = {"font.size": 8.5, "pdf.fonttype": 42, "axes.linewidth": 0.6}
 #: Triangles are painted in pixels, not as lines: a report is to be sent by a narrow link.
 _DPI = 170
 _PICTURE_PX = 560
@@ -94,21 +94,21 @@ def _value(d: Mapping[str, Any], key: str, unit: str, digits: int, *, interval: 
     value = d.get(key)
     if value is None:
         return "—"
-    text = f"{value:.{digits}f}"
+    half = _half_width(d, key) if interval else None
+    return f"{value:.{digits}f}{'' if half is None else f' ± {half:.{digits}f}'} {unit}"
+
+
+def _half_width(d: Mapping[str, Any], key: str) -> float | None:
     between = (d.get("intervals") or {}).get(key)
-    if interval and between and None not in between:
-        text += f" ± {(between[1] - between[0]) / 2:.{digits}f}"
-    return f"{text} {unit}"
+    return (between[1] - between[0]) / 2 if between and None not in between else None
 
 
 def _axis(d: Mapping[str, Any], north: float) -> str:
     if d.get("heading_rad") is None:
         return "—"
-    text = f"{axis_bearing_deg(d['heading_rad'], north):05.1f}"
-    between = (d.get("intervals") or {}).get("heading_rad")
-    if between and None not in between:
-        text += f" ± {math.degrees(between[1] - between[0]) / 2:.1f}"
-    return f"{text} °"
+    half = _half_width(d, "heading_rad")
+    spread = "" if half is None else f" ± {math.degrees(half):.1f}"
+    return f"{axis_bearing_deg(d['heading_rad'], north):05.1f}{spread} °"
 
 
 def _position(contact: Mapping[str, Any]) -> str:
@@ -200,7 +200,7 @@ def sheet_of(store: ViewStore, contact: str = "") -> Sheet:
             row = [label, _value(dimensions, key, unit, digits)]
             rows.append(row + ([_value(truth, key, unit, digits, interval=False)] if truth else []))
     if dimensions.get("heading_rad") is not None:
-        north = float(report.get("north_deg") or 0.0)
+        north = north_shown_deg(scene)
         rows.append(["Axis bears", _axis(dimensions, north)])
         if truth:
             rows[-1].append(_axis({**truth, "intervals": None}, north))
@@ -224,7 +224,7 @@ def sheet_of(store: ViewStore, contact: str = "") -> Sheet:
         versions=f"made by csas-shadow {__version__}"
         + (f", of a result of csas-shadow {report['version']}" if report.get("version") else ""),
     )
-    _add_pictures(sheet, store, one, report)
+    _add_pictures(sheet, store, one, scene)
     return sheet
 
 
@@ -285,15 +285,15 @@ def _surface(store: ViewStore, contact: Mapping[str, Any]) -> trimesh.Trimesh | 
 
 
 def _add_pictures(
-    sheet: Sheet, store: ViewStore, contact: Mapping[str, Any], report: Mapping[str, Any]
+    sheet: Sheet, store: ViewStore, contact: Mapping[str, Any], scene: Mapping[str, Any]
 ) -> None:
     # How well each view is explained is known of the target alone.
     found = None if contact.get("volume") == "main" else view_of_shadow(store, contact)
-    mesh, found = _surface(store, contact), found or best_view(store, report)
+    mesh, found = _surface(store, contact), found or best_view(store, scene["report"] or {})
     if found is not None:
         _, entry = found
         aspect = math.degrees(entry.info.aspect_rad) % 360.0
-        bearing = (90.0 + float(report.get("north_deg") or 0.0) - aspect) % 360.0
+        bearing = (90.0 + north_shown_deg(scene) - aspect) % 360.0
         sheet.pictures.append(
             (
                 f"Best shadow, sonar up; the sonar bears {bearing:03.0f}°",
@@ -304,7 +304,7 @@ def _add_pictures(
         sheet.pictures.append(
             (
                 "Colour by aspect, north up",
-                lambda axes: _draw_colours(axes, store, contact, float(report.get("north_deg") or 0.0)),
+                lambda axes: _draw_colours(axes, store, contact, north_shown_deg(scene)),
             )
         )
     if mesh is not None:
@@ -427,7 +427,7 @@ def _wrapped(lines: list[str], width: int, most: int) -> str:
 
 def as_pdf(sheet: Sheet) -> bytes:
     """Write a report as a PDF of one page."""
-    with mpl.rc_context(_STYLE):  # type: ignore[arg-type]
+    with mpl.rc_context(_STYLE):
         figure = Figure(figsize=_PAGE)
         FigureCanvasPdf(figure)
         _lay_out(figure, sheet)
@@ -527,7 +527,7 @@ def _dimension_table(figure: Figure, sheet: Sheet, left: float) -> None:
 
 
 def _png(draw: Draw, inches: float) -> str:
-    with mpl.rc_context(_STYLE):  # type: ignore[arg-type]
+    with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(inches, inches), layout="constrained")
         FigureCanvasAgg(figure)
         draw(figure.add_subplot())

@@ -33,6 +33,11 @@ def north_deg(report: Mapping[str, Any]) -> float:
     return float(heading) if isinstance(heading, int | float) and math.isfinite(heading) else 0.0
 
 
+def north_shown_deg(scene: Mapping[str, Any]) -> float:
+    """Return where true north is in what the page shows: `north_deg` of its report, 0 before there is one."""
+    return float(_mapping(scene.get("report")).get("north_deg") or 0.0)
+
+
 def axis_bearing_deg(heading_rad: float, north_deg: float = 0.0) -> float:
     """Return the true bearing, 0° up to 180°, of an axis that heads somewhere in the scene.
 
@@ -122,4 +127,4 @@ def about(report: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-__all__ = ["about", "axis_bearing_deg", "contacts_of", "geographic", "north_deg"]
+__all__ = ["about", "axis_bearing_deg", "contacts_of", "geographic", "north_deg", "north_shown_deg"]

@@ -16,6 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from ..core.geometry import ViewInfo
 from . import codes
 from .codes import LOW_DB, STEP_DB
+from .contacts import north_shown_deg
 from .store import SETS, Entry, ViewerError, ViewStore
 
 #: Levels from black to white, dB over the view's median: as the page opens.
@@ -198,7 +199,7 @@ def moving_picture(store: ViewStore, name: str = "shadow", contact: str = "") ->
     views = views[:: math.ceil(len(views) / _FRAMES)]
     reach = 1.15 * (about["size_m"] / 2 + max(shadow_m(e.info, about) for e in views))
     room = 22
-    north = float((store.scene()["report"] or {}).get("north_deg") or 0.0)
+    north = north_shown_deg(store.scene())
     window = Window(about["position_m"], 2 * reach, to_north(north), _GIF_PX - 2 * room)
     radius, middle = window.pixels / 2, _GIF_PX / 2
     rows, cols = np.ogrid[: window.pixels, : window.pixels]

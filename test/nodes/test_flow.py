@@ -284,6 +284,55 @@ def test_no_view_is_lost_however_long_a_stage_is_away_that_was_killed_after_othe
     assert not flow.lost
 
 
+def test_no_view_is_lost_because_consumers_begin_again_while_it_is_on_its_way() -> None:
+    """Each that comes back has all views in flight sent at once: that a copy is under way says nothing."""
+    flow, clock = make_flow(200, window=4)
+    sink = Consumer(flow)
+    flow.look()
+    for begun in range(1, 9):
+        recorder = Consumer(flow, "bag_recorder", n=begun)
+        for _ in range(4):
+            wait(flow, clock, 0.25, sink, recorder)
+            for stamp in take_all(flow):
+                if stamp != 3:
+                    sink.report(stamp)
+                    recorder.report(stamp)
+        recorder.beat(leaving="true")
+    assert not flow.lost, flow.notes
+
+
+def test_no_view_is_lost_behind_a_stage_that_is_away_while_another_sink_gets_all_of_them_anew() -> None:
+    """What passes by another way tells nothing of a view that waits for a stage that was killed."""
+    flow, clock = make_flow(36, window=4)
+    carver = Consumer(flow, stream="shadow_mask")
+    network = Consumer(flow, "network", "stage", "shadow")
+    composites = Consumer(flow, "composites", stream="sub_aperture")
+    wait(flow, clock, 0.25, carver, network, composites)
+    while flow.done < 34:
+        for stamp in take_all(flow):
+            composites.report(stamp)
+            if stamp <= 34:  # the network is killed before the last two
+                network.report(stamp)
+                carver.report(stamp)
+    composites.beat(leaving="true")
+    second = Consumer(flow, "composites", stream="sub_aperture", n=2)
+    for _ in range(40):
+        wait(flow, clock, 0.25, carver, second)
+        for stamp in take_all(flow):
+            second.report(stamp)
+    assert not flow.lost
+    assert flow.done == 34
+    third = Consumer(flow, "network", "stage", "shadow", n=2)
+    for _ in range(8):
+        wait(flow, clock, 0.25, carver, second, third)
+        for stamp in take_all(flow):
+            second.report(stamp)
+            third.report(stamp)
+            carver.report(stamp)
+    assert flow.finished
+    assert flow.done == 36
+
+
 def test_a_view_that_was_given_up_is_sent_again_to_whoever_comes() -> None:
     flow, clock = make_flow(200, window=4, max_attempts=3)
     sink = Consumer(flow)

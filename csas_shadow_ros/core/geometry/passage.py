@@ -636,8 +636,8 @@ class _Passages:
     ) -> tuple[IntArray, BoolArray]:
         """Return which passage of each aspect counts, and whether a stamp tells so."""
         start = int(self.owner.track.stamps_ns[0])
-        best = np.full(len(self.times), np.inf)
-        told = np.zeros(_BINS, bool)
+        best: NDArray[np.float64] = np.full(len(self.times), np.inf)
+        told: BoolArray = np.zeros(_BINS, bool)
         if image_ns is not None:
             late = self.times - (image_ns - start)
             # Passages until the stamp by how long ago they are; all later ones come after those.

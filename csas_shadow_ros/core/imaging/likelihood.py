@@ -213,8 +213,8 @@ def _block_medians(
     n_v, n_u = max(rows // block, 1), max(cols // block, 1)
     height, width = min(block, rows), min(block, cols)
     # Neighbouring pixels hold the same speckle: every other one tells as much.
-    tiles = np.empty((n_v * n_u, -(-height // 2) * -(-width // 2)), np.float32)
-    whole = np.empty(n_v * n_u, np.int64)
+    tiles: NDArray[np.float32] = np.empty((n_v * n_u, -(-height // 2) * -(-width // 2)), np.float32)
+    whole: NDArray[np.int64] = np.empty(n_v * n_u, np.int64)
     found = _whole_blocks(amplitude, (n_v, n_u), (height, width), tiles, whole)
     tiles, whole = tiles[:found], whole[:found]
     middle = tiles.shape[1] // 2

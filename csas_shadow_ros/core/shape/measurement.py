@@ -369,7 +369,7 @@ class PlanFit:
             for index, side in enumerate(sides)
             for phi in side.direction_rad
         ]
-        seen = np.array(pairs, dtype=np.float64).reshape(-1, 4)
+        seen: FloatArray = np.array(pairs, dtype=np.float64).reshape(-1, 4)
         # The fit makes 1e-4 m of the FFT's rounding, 1e-9 m: to a hundredth of a voxel the same image leaves
         # the same sides, whether it came whole or as a sum of sectors. Edges are ten times less sure.
         seen[:, 1] = np.round(_agreed_support(sides), digits_of(grid.volume.voxel_size_m))

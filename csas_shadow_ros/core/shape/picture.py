@@ -76,7 +76,7 @@ def _draw_plan(axes: Any, result: Result) -> None:
         x, y = volume.x_m, volume.y_m
         extent = (x[0] - d / 2, x[-1] + d / 2, y[0] - d / 2, y[-1] + d / 2)
         style = {"origin": "lower", "cmap": "viridis", "vmin": 0.0, "interpolation": "nearest"}
-        shown = axes.imshow(np.ma.masked_invalid(top), extent=extent, **style)
+        shown = axes.imshow(np.where(np.isfinite(top), top, np.nan), extent=extent, **style)
         left, right, bottom, upper = extent
         if body.any():
             rows, cols = np.flatnonzero(body.any(axis=(0, 2))), np.flatnonzero(body.any(axis=(0, 1)))
@@ -111,7 +111,7 @@ def _draw_side(axes: Any, result: Result) -> None:
     x, z = volume.x_m, volume.z_m
     extent = (x[0] - d / 2, x[-1] + d / 2, z[0] - d / 2, z[-1] + d / 2)
     style = {"origin": "lower", "cmap": "cividis_r", "interpolation": "nearest"}
-    shown = axes.imshow(np.ma.masked_equal(through, 0.0), extent=extent, **style)
+    shown = axes.imshow(np.where(through > 0.0, through, np.nan), extent=extent, **style)
     axes.figure.colorbar(shown, ax=axes, label="through (m)", shrink=0.7)
     axes.set_aspect("equal")
     axes.set_title(title)
@@ -129,7 +129,7 @@ def _draw_shadow(axes: Any, result: Result) -> None:
     extent = view_extent(view, target.position_m)
     known = np.isfinite(pixels)
     levels = level_image(pixels, _RANGE_DB) if (pixels[known] > 0).any() else pixels
-    axes.imshow(np.ma.masked_where(~known, levels), cmap="gray", extent=extent)
+    axes.imshow(np.where(known, levels, np.nan), cmap="gray", extent=extent)
     axes.set_facecolor("lightsteelblue")  # where the view knows nothing
     across = 0.5 * math.hypot(*target.size_m[:2])
     height = result.dimensions.height_m if result.dimensions is not None else target.size_m[2]

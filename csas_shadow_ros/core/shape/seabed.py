@@ -188,7 +188,8 @@ def seabed_slope(
     order = np.arange(1, _HARMONICS + 1)
     cosine, sine = np.cos(aspect[:, None] * order), np.sin(aspect[:, None] * order)
     none = np.zeros((len(ends), 1))
-    gradient, sigma = np.zeros(2), math.nan
+    gradient: NDArray[np.float64] = np.zeros(2)
+    sigma = math.nan
     for _ in range(_ROUNDS):
         h = sonar[:, 2] - s @ gradient
         if h.min() <= height_m:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
@@ -77,14 +78,14 @@ class Peer:
 @dataclass
 class _Sent:
     at_s: float
-    #: How many views were done when it was sent last.
-    done_before: int
     attempts: int = 1
-    #: Attempts of which nothing was heard while others got through: only such ones tell that it vanished.
-    #: Where a stage is away nothing gets through, for however long.
+    #: Attempts that a last consumer did not get while it got later ones: only those tell that it vanished.
+    #: Where a stage is away nothing gets to those behind it, for however long, whatever others get.
     vanished: int = 0
-    overtaken: int = 0
+    #: How many later views each last consumer (key) has reported for the first time.
+    overtaken: Counter[str] = field(default_factory=Counter)
     serial: int = 0
+    #: A consumer came back: what was on its way has probably died with its predecessor.
     due: bool = False
 
 
@@ -108,7 +109,7 @@ class Flow:
     sink_wait_s : float
         How long a sink that vanished, or any first consumer, is waited for.
     max_attempts : int
-        A view that vanishes so many times while others get through is lost.
+        A view that vanishes so many times, while later ones get to a last consumer that lacks it, is lost.
     min_sinks : int
         Nothing is sent before so many sinks are there (or `sink_wait_s` is over).
     settle_s : float
@@ -152,7 +153,7 @@ class Flow:
         self._names: set[tuple[str, str]] = set()
         self._leaves: list[Peer] = []
         self._known_leaves: frozenset[str] = frozenset()
-        self._done_count = 0
+        self._any_done = False
         self._serial = 0
         self._progress_s = self._born_s = self._served_s = self._looked_s = self.clock()
         self._subscribers = 0
@@ -250,9 +251,8 @@ class Flow:
             self.lost.clear()
             self._recount()  # what was given up is missing again
         if name in self._names:
-            # It was there and is there again: what was on its way meanwhile has probably died with it.
             for sent in self._in_flight.values():
-                sent.due, sent.attempts = True, 1
+                sent.due, sent.attempts, sent.vanished = True, 1, 0
             self._progress_s = self.clock()
         self._names.add(name)
 
@@ -265,10 +265,17 @@ class Flow:
             self._rejected_at.setdefault(place_of(peer.stream), set()).add(stamp)
         if fresh:
             self._progress_s = self.clock()
+            self._overtakes(stamp, peer.key)
         if stamp in self._in_flight and self._is_done(stamp):
             self._retire(stamp)
         elif stamp in self._missing and self._is_done(stamp):
             del self._missing[stamp]
+
+    def _overtakes(self, stamp: int, key: str) -> None:
+        """Note of earlier views that a last consumer has got this later one."""
+        if (sent := self._in_flight.get(stamp)) is not None:
+            for other in self._in_flight.values():
+                other.overtaken[key] += other.serial < sent.serial
 
     def transported(self) -> None:
         """State that the transport has delivered everything in flight (used if nobody reports)."""
@@ -278,13 +285,10 @@ class Flow:
                 self._retire(stamp)
 
     def _retire(self, stamp: int) -> None:
-        sent = self._in_flight.pop(stamp)
+        del self._in_flight[stamp]
         self._missing.pop(stamp, None)
-        self._done_count += 1
+        self._any_done = True
         self._progress_s = self.clock()
-        for other in self._in_flight.values():
-            if other.serial < sent.serial:
-                other.overtaken += 1
 
     # Who must have what
 
@@ -299,13 +303,21 @@ class Flow:
     def _is_done(self, stamp: int) -> bool:
         if not self._leaves:
             return stamp in self._reports.get(TRANSPORT, ())
+        return next(self._lacking(stamp), None) is None
+
+    def _lacking(self, stamp: int) -> Iterator[str]:
+        """Iterate the last consumers (keys) that have not reported a view, nor anybody's refusal of it."""
         for leaf in self._leaves:
             if stamp in self._reports.get(leaf.key, ()):
                 continue
             place = place_of(leaf.stream)
             if not any(at < place and stamp in stamps for at, stamps in self._rejected_at.items()):
-                return False
-        return True
+                yield leaf.key
+
+    def _overtaken(self, stamp: int) -> int:
+        """Say how many later views have got through to a last consumer that lacks this one."""
+        overtaken = self._in_flight[stamp].overtaken
+        return max((overtaken[key] for key in self._lacking(stamp)), default=0)
 
     def _recount(self) -> None:
         out = self._refused
@@ -416,9 +428,10 @@ class Flow:
             return None
         now = self.clock()
         for stamp, sent in self._in_flight.items():
-            if not self._is_due(sent, now):
+            if not self._is_due(stamp, now):
                 continue
-            sent.vanished += self._done_count > sent.done_before
+            # A copy sent because somebody came back tells nothing of the one before, which may be under way.
+            sent.vanished += not sent.due and self._overtaken(stamp) > 0
             if sent.vanished >= self.max_attempts:
                 reason = f"sent {sent.attempts} times, never reported though others were"
                 self.lost[stamp] = reason
@@ -429,15 +442,15 @@ class Flow:
             self._serial += 1
             self.resends += 1
             sent.attempts += 1
-            sent.at_s, sent.serial, sent.overtaken, sent.due = now, self._serial, 0, False
-            sent.done_before = self._done_count
+            sent.at_s, sent.serial, sent.due = now, self._serial, False
+            sent.overtaken.clear()
             return stamp
         if not fresh or self.held or len(self._in_flight) >= self.window:
             return None
         for stamp in self._missing:
             if stamp not in self._in_flight and stamp not in self.lost:
                 self._serial += 1
-                self._in_flight[stamp] = _Sent(now, self._done_count, serial=self._serial)
+                self._in_flight[stamp] = _Sent(now, serial=self._serial)
                 return stamp
         return None
 
@@ -445,15 +458,16 @@ class Flow:
         """Return the view that `next` would send for the first time, without sending it."""
         return next((s for s in self._missing if s not in self._in_flight and s not in self.lost), None)
 
-    def _is_due(self, sent: _Sent, now: float) -> bool:
-        if sent.due or sent.overtaken >= 2 * self.window:
+    def _is_due(self, stamp: int, now: float) -> bool:
+        sent = self._in_flight[stamp]
+        if sent.due or self._overtaken(stamp) >= 2 * self.window:
             return True
         if self.acknowledged_by_transport:
             return False
         # Later attempts wait longer: a slow consumer must not drown in copies. While others get through
         # the view may merely be queued, so the time runs from the last progress of any view.
         # Before anything got through, links of the graph may just not have found each other yet.
-        first = self.resend_s if self._done_count else min(self.resend_s, _FIRST_RESEND_S)
+        first = self.resend_s if self._any_done else min(self.resend_s, _FIRST_RESEND_S)
         patience = min(first * 2.0 ** (sent.attempts - 1), max(_LONGEST_BACKOFF_S, self.resend_s))
         return now - max(sent.at_s, self._progress_s) > patience
 
