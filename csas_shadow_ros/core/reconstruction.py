@@ -239,6 +239,8 @@ class Reconstruction:
         self.frame = decision.frame
         #: How many views there will be at most; 0: nobody knows.
         self.most_views = 0
+        #: Views that were lost on their way here, as a source has said.
+        self.views_lost = 0
         self._compose = compose
         self._best: tuple[int, View | None] = (-1, None)
 
@@ -413,6 +415,7 @@ class Reconstruction:
             sign=self.decision.sign,
             composites=self.composites,
             views_used=len(self.stamps),
+            views_lost=self.views_lost,
             arc_rad=self.arcs.covered_rad,
             rejected=dict(self.rejected),
             left_out=list(self.decision.left_out),

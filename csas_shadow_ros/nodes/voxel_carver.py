@@ -223,9 +223,11 @@ class VoxelCarverNode(CsasNode):
         """Finish once a source says that every view has arrived."""
         own = beat.values.get("target", self.target.stamp) == self.target.stamp
         if beat.values.get("stream") != "sector" and own:
+            if self.reconstruction is not None:
+                self.reconstruction.views_lost = beat.counts.get("lost", 0)
+                if not beat.counts.get("more_to_come", 1):
+                    self.reconstruction.most_views = beat.counts.get("total", 0)
             self.growing.source_says(self.inlet.instance in beat.values.get("finished_for", "").split())
-            if self.reconstruction is not None and not beat.counts.get("more_to_come", 1):
-                self.reconstruction.most_views = beat.counts.get("total", 0)
 
     # Results
 

@@ -519,6 +519,19 @@ def test_a_bag_is_recorded_by_one_recorder_at_a_time(graph: Graph, tmp_path: Pat
         second.destroy_node()
 
 
+def test_a_result_says_that_views_were_lost_on_their_way(
+    graph: Graph, view_bag: Callable[[str], Path], reference: Reference
+) -> None:
+    carver = graph.add(VoxelCarverNode, **SOFT, **given_target(reference))
+    player = graph.add(BagPlayerNode, bag=str(view_bag("likelihood")), rate=0.0, min_sinks=1)
+    graph.spin_until(lambda: carver.state_counts()["views"] >= 6)
+    player.source.flow.lost[max(v.shadow.info.stamp_ns for v in reference[1])] = "the test has taken it"
+    graph.spin_until(complete(carver))
+    assert carver.state_counts()["views"] == 35
+    assert carver.result.quality.verdict == "limited"
+    assert "1 of 36 views were lost on their way" in carver.result.quality.reasons
+
+
 def test_a_lifecycle_manager_can_hold_end_and_begin_a_run_again(
     graph: Graph, view_bag: Callable[[str], Path], reference: Reference
 ) -> None:

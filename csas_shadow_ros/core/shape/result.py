@@ -169,6 +169,8 @@ class Result:
         Multi-look and colour-by-aspect images.
     views_used : int
         Views in the grid.
+    views_lost : int
+        Views that the graph could not get to whoever needs them: the grid is without them.
     arc_rad : float
         How much of the circle their apertures cover.
     rejected : dict
@@ -211,6 +213,7 @@ class Result:
     matter_mesh: trimesh.Trimesh | None = None
     composites: Composites | None = None
     views_used: int = 0
+    views_lost: int = 0
     arc_rad: float = 0.0
     rejected: dict[float, str] = field(default_factory=dict)
     evidence: dict[int, ViewEvidence] = field(default_factory=dict)

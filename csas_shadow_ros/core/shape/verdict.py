@@ -109,6 +109,10 @@ def _views_of(result: Result, reasons: list[str]) -> int:
         first = next(iter(result.rejected.values()))
         reasons.append(f"{refused} of {refused + result.views_used} views were not used: {first}")
         worst = max(worst, 1)
+    if result.views_lost:
+        of = result.views_used + refused + result.views_lost
+        reasons.append(f"{result.views_lost} of {of} views were lost on their way")
+        worst = max(worst, 1)
     worst = max(worst, _fit_of(result, reasons))
     if result.by_likelihood_alone:
         reasons.append(
