@@ -486,7 +486,9 @@ class _Host:
         return {}
 
 
-def spin(node: Any, timeout_s: float | None = None) -> None:
+def spin(
+    node: Any, timeout_s: float | None = None, *, until: Callable[[], bool] = lambda: False
+) -> None:
     """Spin a node until SIGINT or SIGTERM, and leave it able to say goodbye.
 
     ``rclpy.spin`` does as well, but on Ctrl-C rclpy cuts the node off first: the graph then waits for it as
@@ -498,6 +500,8 @@ def spin(node: Any, timeout_s: float | None = None) -> None:
         The node.
     timeout_s : float, optional
         Come back after so long.
+    until : callable, optional
+        Come back once it returns True; asked twenty times a second.
     """
     uninstall_signal_handlers()
     stop = threading.Event()
@@ -507,6 +511,8 @@ def spin(node: Any, timeout_s: float | None = None) -> None:
     end = None if timeout_s is None else time.monotonic() + timeout_s
     try:
         while not stop.is_set() and node.context.ok() and (end is None or time.monotonic() < end):
+            if until():
+                return
             executor.spin_once(timeout_sec=_STOP_S)
     except ExternalShutdownException:
         pass

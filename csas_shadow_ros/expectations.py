@@ -177,6 +177,11 @@ def _expectation(path: str | Path, name: str, value: Any, number: int) -> Expect
         allowed = tuple(value) if isinstance(value, list) else (value,)
         if not allowed or not all(isinstance(one, str | int | float) for one in allowed):
             raise ParameterError(f"{path}: {name} is {value!r}; expected a value, a list of them, or bounds")
+        words = _words(name)
+        for one in allowed:
+            if one not in words if words else isinstance(one, str):
+                expected = f"one of: {', '.join(words)}" if words else "a number"
+                raise ParameterError(f"{path}: {name} is {one!r}; expected {expected}")
         return Expectation(name, number, allowed)
     keys = set(value)
     numbers = all(isinstance(v, int | float) and math.isfinite(v) for v in value.values())
@@ -191,6 +196,13 @@ def _expectation(path: str | Path, name: str, value: Any, number: int) -> Expect
     if low > high:
         raise ParameterError(f"{path}: {name} is {value!r}, which no value can be")
     return Expectation(name, number, low=low, high=high)
+
+
+def _words(name: str) -> tuple[str, ...]:
+    """Return the words that a value can be; empty if it is a number."""
+    from .core.shape.result import QUALITIES, VERDICTS
+
+    return {"verdict": VERDICTS, "quality": QUALITIES}.get(name, ())
 
 
 @dataclass(frozen=True)

@@ -6,16 +6,22 @@ Rewrite the pages with ``python test/test_readme.py``.
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from csas_shadow_ros.nodes.runtime.params import parameter_table, yaml_text
-from msg_adapters.topics import topic_table
-
 ROOT = Path(__file__).resolve().parents[1]
+# As a script it writes what the tree says, whatever copy of the package is installed.
+sys.path.insert(0, str(ROOT))
+
+from csas_shadow_ros.nodes.runtime.params import parameter_table, yaml_text  # noqa: E402
+from msg_adapters.topics import topic_table  # noqa: E402
+
 README = ROOT / "README.md"
 PARAMETER_FILE = ROOT / "config" / "csas_shadow.yaml"
 
@@ -63,6 +69,34 @@ def test_every_link_in_the_documents_leads_to_a_file(page: Path) -> None:
     links = re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
     missing = [link for link in links if not (page.parent / link).exists()]
     assert not missing, f"{page.name} links to {missing}"
+
+
+@pytest.mark.parametrize("notebook", sorted((ROOT / "docs" / "notebooks").glob("*.py")), ids=lambda n: n.stem)
+def test_every_link_in_a_notebook_leads_to_a_page_of_the_site(notebook: Path) -> None:
+    """The site has pages, not their sources, and does not check what notebooks link to."""
+    links = re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", notebook.read_text(encoding="utf-8"))
+    pages = [(notebook.parent / link).with_suffix(".md") for link in links if link.endswith(".html")]
+    assert len(pages) == len(links), f"{notebook.name} links to {links}; expected .html of the site"
+    assert all(page.exists() for page in pages), links
+
+
+def test_the_script_writes_what_the_tree_says_and_not_an_installed_copy(tmp_path: Path) -> None:
+    for package in ("csas_shadow_ros", "msg_adapters"):
+        shutil.copytree(ROOT / package, tmp_path / package)
+    for part in ("docs", "config", "test"):
+        (tmp_path / part).mkdir()
+    shutil.copytree(ROOT / "docs" / "make", tmp_path / "docs" / "make")
+    for page, _ in PARTS.values():
+        shutil.copy(ROOT / page, tmp_path / page)
+    shutil.copy(__file__, tmp_path / "test" / "test_readme.py")
+    changed = tmp_path / "csas_shadow_ros" / "nodes" / "runtime" / "params.py"
+    text = changed.read_text(encoding="utf-8")
+    assert "record to this new directory" in text
+    changed.write_text(text.replace("record to this new directory", "record to a new directory"), "utf-8")
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    subprocess.run([sys.executable, "test/test_readme.py"], cwd=tmp_path, env=environment, check=True)
+    assert "record to a new directory" in (tmp_path / "docs" / "parameters.md").read_text(encoding="utf-8")
+    assert "record to a new directory" in (tmp_path / "config" / "csas_shadow.yaml").read_text("utf-8")
 
 
 def test_the_readme_is_short() -> None:

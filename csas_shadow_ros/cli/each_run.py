@@ -29,7 +29,9 @@ def runs_and_folders(arguments: argparse.Namespace) -> list[tuple[int | None, Pa
 
 
 def each_run(
-    arguments: argparse.Namespace, one: Callable[[int | None, Path], tuple[int, dict[str, Any]]]
+    console: Console,
+    arguments: argparse.Namespace,
+    one: Callable[[int | None, Path], tuple[int, dict[str, Any]]],
 ) -> int:
     """Make the results of each run that is asked for, and hold them against what is expected."""
     from ..expectations import Checked, check_report, read_expectations, write_junit
@@ -44,6 +46,8 @@ def each_run(
             checked.append(check_report(name, report, expected))
             for fault in checked[-1].unmet:
                 print(f"{PROGRAM}: error: {name}: {fault}", file=sys.stderr)
+            if expected and not checked[-1].unmet:
+                console.notice(f"{name}: as {arguments.expect} expects ({len(expected)} values)")
             code = max(code, own, UNEXPECTED if checked[-1].unmet else OK)
     except (CsasError, OSError) as error:
         reason = f"{type(error).__name__}: {error}"

@@ -110,7 +110,7 @@ def _replay(arguments: argparse.Namespace, console: Console) -> int:
         newest[:] = [out]
         return code, report
 
-    code = each_run(arguments, one)
+    code = each_run(console, arguments, one)
     if port is not None and newest:
         from ..viewer import command
 

@@ -90,4 +90,4 @@ def _run(arguments: argparse.Namespace, console: Console) -> int:
             )
         return give_report(console, out, report), report
 
-    return each_run(arguments, one)
+    return each_run(console, arguments, one)

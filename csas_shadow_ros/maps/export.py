@@ -128,7 +128,7 @@ def _check_place(folder: Path, overwrite: bool) -> None:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not overwrite:
-        raise MapError(f"{folder} exists already; expected a new folder, or --overwrite (overwrite=True)")
+        raise MapError(f"{folder} exists already; expected a new folder, or --overwrite")
     try:
         told: Any = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         ours = told["format"] == FORMAT

@@ -149,7 +149,7 @@ class ResultsWriter:
                 return
             if not self._overwrite:
                 raise ResultsError(
-                    f"{self.folder} exists already; expected a new folder, or --overwrite (overwrite=True)"
+                    f"{self.folder} exists already; expected a new folder, or --overwrite"
                 )
             if is_results_folder(self.folder):
                 return

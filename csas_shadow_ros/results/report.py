@@ -454,7 +454,7 @@ def headline(report: Mapping[str, Any]) -> str:
     text = str(report["verdict"])
     if report.get("why_no_object") and report["verdict"] == "no object":
         text += f": {report['why_no_object']}"
-    return text if quality["verdict"] == "good" else f"{text} ({quality['verdict']})"
+    return f"{text} ({quality['verdict']})"
 
 
 def _sides(d: Mapping[str, Any]) -> str:
@@ -574,9 +574,11 @@ def _carving_lines(report: Mapping[str, Any]) -> list[str]:
 
 def _view_lines(views: Mapping[str, Any]) -> list[str]:
     """Write how many views there were, and why some were not used."""
+    rest = views["in"] - views["used"] - views["rejected"] - views["lost"]
+    needless = f" {rest} not needed, as there was nothing to carve," if rest > 0 and not views["used"] else ""
     return [
         f"views: {views['in']} in, {views['used']} in the grid, {views['rejected']} not used,"
-        f" {views['lost']} lost",
+        f"{needless} {views['lost']} lost",
         *(
             f"  {n} not used{', the first' if n > 1 else ''}: {reason}"
             for reason, n in views["reasons"].items()

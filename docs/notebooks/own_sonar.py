@@ -87,7 +87,7 @@ axes.legend();
 # %% [markdown]
 # ## Your own arrays
 #
-# A processor's image and track take the place of `made`: [Bring your own images](../own_images.md).
+# A processor's image and track take the place of `made`: [Bring your own images](../own_images.html).
 
 # %%
 image = csas.CoherentImage(made.image.pixels, made.image.grid, sonar.acoustics())

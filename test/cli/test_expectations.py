@@ -70,7 +70,7 @@ def test_what_is_as_expected_has_no_fault(tmp_path: Path, report: dict[str, Any]
     ("text", "match"),
     [
         ("verdict: no object", "^verdict is object; expected 'no object'$"),
-        ("quality: [perfect, superb]", "^quality is .*; expected 'perfect' or 'superb'$"),
+        ("verdict: [undecided, no object]", "^verdict is object; expected 'undecided' or 'no object'$"),
         ("length_m: {is: 3, within: 0.2}", r"^length_m is 0\.\d+; expected 2.8 to 3.2$"),
         ("views_used: {min: 1000}", r"^views_used is \d+; expected at least 1000$"),
         ("seconds: {max: 0}", "^seconds is .*; expected at most 0$"),
@@ -98,6 +98,9 @@ def test_what_is_not_as_expected_is_named_with_both_values(
         ),
         ("length_m: {min: a}", "expected numbers named"),
         ("length_m: {min: 2, max: 1}", "which no value can be"),
+        ("verdict: objekt", "verdict is 'objekt'; expected one of: object, no object, undecided"),
+        ("quality: [good, okay]", "quality is 'okay'; expected one of: good, limited, not trustworthy"),
+        ("length_m: long", "length_m is 'long'; expected a number"),
         ("length_m: []", "expected a value, a list of them, or bounds"),
         ("- a", "is not a mapping"),
         ("a: {", "cannot be read"),
@@ -123,6 +126,10 @@ def test_a_run_that_is_not_as_expected_ends_with_4_and_keeps_its_results(
     failed = {case.get("name") for case in suite if case.find("failure") is not None}
     assert failed == {"length_m"}
     assert {case.get("name") for case in suite} == {"run", "verdict", "length_m"}
+    expect.write_text("verdict: object\nlength_m: {min: 0.1}\n")
+    loud = [one for one in common if one not in ("-q", "--quiet")]
+    assert main([*loud, "--overwrite", "--expect", str(expect)]) == 0
+    assert f"out: as {expect} expects (2 values)" in capsys.readouterr().err
 
 
 def test_a_run_that_fails_is_an_error_in_the_junit_file_and_a_slip_costs_no_run(

@@ -445,6 +445,19 @@ def test_a_node_that_waits_names_a_process_whose_port_another_has_replaced(
     graph.spin_until(lambda: told[-1] == "waiting for image and track", what="it is gone")
 
 
+def test_spinning_ends_once_it_is_to(graph: Graph) -> None:
+    asked: list[int] = []
+
+    def until() -> bool:
+        asked.append(1)
+        return len(asked) > 3
+
+    node = rclpy.create_node("classifier", context=graph.context, namespace="csas")
+    client.spin(node, 30.0, until=until)
+    assert len(asked) == 4
+    node.destroy_node()
+
+
 def test_a_subscriber_that_hears_nobody_says_so_and_is_not_waited_for(
     monkeypatch: pytest.MonkeyPatch, reference: Any
 ) -> None:

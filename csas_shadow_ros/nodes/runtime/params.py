@@ -249,6 +249,9 @@ NODES: dict[str, type[Parameters]] = {
 #: Parameters that may change while the node runs. A change of any other would mix two results in one.
 DYNAMIC = frozenset({"window", "resend_s", "sink_wait_s", "publish_hz", "dynamic_range_db", "rate"})
 
+#: Parameters without which their node cannot start.
+REQUIRED = frozenset({"bag", "out"})
+
 #: Overrides that belong to rclpy itself.
 OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
@@ -378,7 +381,9 @@ def parameter_table() -> str:
     for name, kind in NODES.items():
         lines += [f"**{name}**", "", "| parameter | default | range | meaning |", "|---|---|---|---|"]
         for field in dataclasses.fields(kind):
-            default = _yaml_value(field.default).replace('""', '"" (must be given)')
+            default = _yaml_value(field.default)
+            if field.name in REQUIRED:
+                default = default.replace('""', '"" (must be given)')
             lines.append(f"| `{field.name}` | {default} | {expected_of(field)} | {description_of(field)} |")
         lines.append("")
     return "\n".join(lines).rstrip() + "\n"
