@@ -12,6 +12,7 @@ import traceback
 import uuid
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ from .nodes import qos
 from .nodes.runtime.base import BEAT_S, Inlet, ViewOutlet
 from .nodes.runtime.flow import place_of
 from .nodes.runtime.hearing import Reach, avoid_dead_ports
-from .nodes.runtime.pace import Growing
+from .nodes.runtime.pace import Growing, source_is_there
 
 #: What a callback gives back: nothing, the pixels of its result, or in words why it cannot use the view.
 Answer = NDArray[Any] | str | None
@@ -181,7 +182,7 @@ class ViewSubscriber:
         self._run: int | None = None
         self._over: deque[int | None] = deque()
         # As every sink of the package: it says when what there is is final.
-        self._growing = Growing(self._run_is_over, lambda: False, 0.0)
+        self._growing = Growing(self._run_is_over, lambda: False, 0.0, partial(source_is_there, node))
         # The outlet before the inlet: what comes in can go out.
         self._results = results
         self._outlet = None if results is None else ViewOutlet(self._host, results)

@@ -22,6 +22,8 @@ class NodeEntry:
         Streams of views that it makes of them.
     beside : bool
         Whether the run goes on to its end without it.
+    source : bool
+        Whether it sends views on its own account, and says when all are through.
     needed : str
         Why a replay cannot leave it out; empty: it can, as an outside node may take its place.
     """
@@ -30,6 +32,7 @@ class NodeEntry:
     takes: tuple[str, ...] = ()
     gives: tuple[str, ...] = ()
     beside: bool = False
+    source: bool = False
     needed: str = ""
 
 
@@ -37,11 +40,12 @@ class NodeEntry:
 NODES = {
     node.name: node
     for node in (
-        NodeEntry("bag_player", beside=True, needed="it plays the bag"),
+        NodeEntry("bag_player", beside=True, source=True, needed="it plays the bag"),
         NodeEntry(
             "sub_aperture",
             ("image", "sector"),
             ("sub_aperture",),
+            source=True,
             needed="it decides what is carved, and sends every view until all have it",
         ),
         NodeEntry("shadow_enhancement", ("sub_aperture",), ("shadow",)),
@@ -56,6 +60,10 @@ NODES = {
 
 #: What a replay can leave out.
 REPLACEABLE = tuple(name for name, node in NODES.items() if not node.needed)
+
+
+#: Who says when all views are through.
+SOURCES = tuple(name for name, node in NODES.items() if node.source)
 
 
 def chain(stream: str) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from functools import partial
 from typing import Any
 
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from msg_adapters.topics import stream as stream_of
 
 from . import qos
 from .runtime.base import INTEGRATED, CsasNode, Inlet, run_node
-from .runtime.pace import Growing
+from .runtime.pace import Growing, source_is_there
 from .runtime.runs import RunFollower
 
 _PICTURES = ("multilook", "color_by_aspect")
@@ -39,7 +40,9 @@ class CompositesNode(CsasNode):
             )
             for name in _PICTURES
         }
-        self.growing = Growing(self.publish_result, self.wanted, self.parameters.publish_hz)
+        self.growing = Growing(
+            self.publish_result, self.wanted, self.parameters.publish_hz, partial(source_is_there, self)
+        )
         self.runs = RunFollower(self, lambda *_: self.inlet.release())
         self.inlet = Inlet(self, "sub_aperture", "sink", self.work, hold=self.runs.hold)
         self.follow_sources()

@@ -28,7 +28,7 @@ from msg_adapters.topics import OTHER_METHOD, PREFIXED_TOPICS, RESULT_TOPICS, ob
 
 from . import qos
 from .runtime.base import INTEGRATED, CsasNode, Inlet, TargetInlet, run_node
-from .runtime.pace import Growing
+from .runtime.pace import Growing, source_is_there
 from .runtime.params import part
 from .runtime.place import PlaceOnEarth
 from .runtime.runs import RunFollower
@@ -64,7 +64,9 @@ class VoxelCarverNode(CsasNode):
             likelihood=part(p, LikelihoodParameters),
             shadow=part(p, ShadowParameters),
         )
-        self.growing = Growing(self.publish_result, self.wanted, p.publish_hz)
+        self.growing = Growing(
+            self.publish_result, self.wanted, p.publish_hz, partial(source_is_there, self)
+        )
         self.runs = RunFollower(self, lambda *_: self.release())
         self.target = TargetInlet(self, self.on_target, self.begin_again)
         self.place = PlaceOnEarth(self, self.on_place)

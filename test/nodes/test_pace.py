@@ -11,11 +11,18 @@ from csas_shadow_ros.nodes.runtime.pace import IDLE_S, SOURCE_GONE_S, SOURCE_SIL
 class Made:
     """A growing result on a clock of its own; what was published, and whether as the end result."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, looked_at: bool = False, hz: float = 0.0) -> None:
+    def __init__(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        *,
+        looked_at: bool = False,
+        hz: float = 0.0,
+        source: bool = False,
+    ) -> None:
         self.now = 1000.0
         monkeypatch.setattr(pace.time, "monotonic", lambda: self.now)
         self.told: list[tuple[float, bool]] = []
-        self.growing = Growing(self._publish, lambda: looked_at, hz)
+        self.growing = Growing(self._publish, lambda: looked_at, hz, lambda: source)
 
     def _publish(self) -> None:
         self.told.append((round(self.now - 1000.0, 1), self.growing.final))
@@ -66,6 +73,16 @@ def test_without_any_source_a_result_that_rests_is_the_end_result(made):
     made.wait(IDLE_S + 0.5)
     assert made.told == [(pytest.approx(IDLE_S, abs=0.3), True)]
     assert not made.growing.complete, "nobody has said so"
+
+
+def test_who_has_not_heard_the_source_yet_ends_no_run(monkeypatch):
+    """A killed sink's successor on a busy machine gets its first views before the source's first word."""
+    made = Made(monkeypatch, source=True)
+    made.growing.changed()
+    made.wait(SOURCE_GONE_S - 1.0)
+    assert [final for _, final in made.told] == [False], "shown as it is, and as no end"
+    made.wait(2.0)
+    assert made.told[-1] == (pytest.approx(SOURCE_GONE_S, abs=0.3), True), "it never said a word"
 
 
 def test_a_source_that_is_silent_is_told(made):

@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from typing import Any
+
+from csas_shadow_ros.node_table import SOURCES
 
 #: Without a source that tells the end, a result that has not changed for so long is shown as it is.
 IDLE_S = 2.0
@@ -15,6 +18,12 @@ SOURCE_SILENT_S = 3.0
 SOURCE_GONE_S = 60.0
 #: After a burst of views that has been over for so long, publishing holds up nobody.
 _QUIET_S = 0.06
+
+
+def source_is_there(node: Any) -> bool:
+    """Say whether a node of the package that tells the end of a run reports in a node's namespace."""
+    found = node.get_publishers_info_by_topic(node.resolve_topic_name("progress"))
+    return any(publisher.node_name in SOURCES for publisher in found)
 
 
 class Growing:
@@ -28,11 +37,21 @@ class Growing:
         Says whether anybody looks.
     hz : float
         Most often; while views are coming in less, where publishing takes more than a tenth of the time.
+    source_there : callable
+        Says whether a source that tells the end is there, also if nothing has been heard of it yet. Where
+        none is, the end is that nothing comes any more.
     """
 
-    def __init__(self, publish: Callable[[], None], wanted: Callable[[], bool], hz: float) -> None:
+    def __init__(
+        self,
+        publish: Callable[[], None],
+        wanted: Callable[[], bool],
+        hz: float,
+        source_there: Callable[[], bool],
+    ) -> None:
         self._publish = publish
         self._wanted = wanted
+        self._source_there = source_there
         self.set_rate(hz)
         #: Whether all views are in and the result is published.
         self.complete = False
@@ -83,13 +102,20 @@ class Growing:
             self._do(now)
             self.complete = True
         elif self._open:
-            silent_s = now - self._source_s
-            rests = silent_s > SOURCE_SILENT_S and now - self._changed_s > IDLE_S
-            self.final = rests and silent_s > SOURCE_GONE_S
+            silent_s, same_s = now - self._source_s, now - self._changed_s
+            rests = silent_s > SOURCE_SILENT_S and same_s > IDLE_S
+            self.final = rests and self._is_gone(silent_s, same_s)
             quiet = now - self._changed_s > _QUIET_S
             due = now - self._published_s > max(self.period_s, 0.0 if quiet else 10.0 * self._cost_s)
             if self.final or (self._dirty and (rests or (due and self._wanted()))):
                 self._do(now)
+
+    def _is_gone(self, silent_s: float, same_s: float) -> bool:
+        """Say whether nothing more will come, as far as anybody can know."""
+        if math.isfinite(silent_s):
+            return silent_s > SOURCE_GONE_S
+        # Never heard of: who has only begun on a busy machine may get views before a source's first word.
+        return same_s > SOURCE_GONE_S or not self._source_there()
 
     def _do(self, now: float) -> None:
         self._dirty = False
