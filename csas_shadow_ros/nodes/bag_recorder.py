@@ -37,9 +37,9 @@ _MOST_STANDING = 16
 _ENDS_THE_RUN_BEFORE = frozenset({"measurements", "voxel_grid/image"})
 #: Bags of one recorder, at most.
 _MOST_RUNS = 10_000
-#: What begins a run, and may come before its track; so many such messages wait for it at most.
-_BEGIN_A_RUN = frozenset({"image", "camera_info", "sector/image", "sector/camera_info"})
-_MOST_UNPLACED = 16
+#: So many messages wait for the track of their run at most: the views in flight of every stream, and what is
+#: latched. Of more, views give way: they are sent again.
+_MOST_UNPLACED = 128
 _FLUSH_S = 1.0
 #: So much of the disk is left free: an index of 10 000 views, some MB, is needed to finish a bag, and others
 #: that share the disk (logs, results) can still say what is wrong.
@@ -125,7 +125,7 @@ class BagRecorderNode(CsasNode):
         #: Tracks of runs of which nothing else has come yet: (when, message), a run.
         self._tracks: dict[int, list[tuple[int, bytes]]] = {}
         self._over: set[int] = set()
-        #: Images and sectors whose stamp no track covers yet: (since, topic, message).
+        #: Messages whose stamp no track covers yet: (since, topic, message).
         self._unplaced: list[tuple[float, str, bytes]] = []
         self._standing: deque[tuple[str, int, bytes]] = deque(maxlen=_MOST_STANDING)
         self._flushed_s = 0.0
@@ -211,6 +211,10 @@ class BagRecorderNode(CsasNode):
 
     def _close_bag(self, bag: RunBag) -> None:
         self._bags.remove(bag)
+        for topic, stamp, _ in bag.seen:
+            if topic in self._flows:
+                inlet, is_info = self._flows[topic]
+                inlet.stamps[is_info].discard(stamp)  # a mission of days has millions
         if bag.run_ns is not None:
             self._over.add(bag.run_ns)
         try:
@@ -278,9 +282,9 @@ class BagRecorderNode(CsasNode):
         """Write what has a stamp into the bag of its run, which it may begin."""
         stamp = None if topic in _NEVER_ALIKE else message_stamp(cdr, topic)
         run_ns = None if stamp is None else self._book.run_of(stamp)
-        if run_ns is None and topic in _BEGIN_A_RUN and self._book.names and not late:
-            # It may have overtaken its track.
-            self._unplaced = [*self._unplaced[1 - _MOST_UNPLACED :], (time.monotonic(), topic, cdr)]
+        if run_ns is None and stamp is not None and self._book.names and not late:
+            # It may have overtaken its track, as views do that reach a recorder which has just begun again.
+            self._wait_for_track(topic, cdr)
             return
         if run_ns in self._over:
             raise BagError(f"{topic} of the run of {run_ns} ns came after its bag was finished; not recorded")
@@ -296,6 +300,13 @@ class BagRecorderNode(CsasNode):
         if topic in _ENDS_THE_RUN_BEFORE:
             for older in self._bags[: self._bags.index(bag)]:
                 self._close_bag(older)
+
+    def _wait_for_track(self, topic: str, cdr: bytes) -> None:
+        """Keep a message until its track comes; if there are too many, the oldest view goes."""
+        self._unplaced.append((time.monotonic(), topic, cdr))
+        if len(self._unplaced) > _MOST_UNPLACED:
+            gone = next((n for n, (_, name, _) in enumerate(self._unplaced) if name in self._flows), 0)
+            del self._unplaced[gone]
 
     # Room
 
@@ -404,6 +415,10 @@ class BagRecorderNode(CsasNode):
         for inlet in self.inlets:
             if isinstance(inlet, RecordingInlet):
                 inlet.report_taken_over()
+
+    def waiting_for_tracks(self) -> int:
+        """Return how many messages wait for the track of their run."""
+        return len(self._unplaced)
 
     def state_values(self) -> dict[str, str]:
         """Return the recorded run, its bag, and the latched topics that this has messages of."""

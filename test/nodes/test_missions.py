@@ -15,6 +15,7 @@ from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M, Graph
 
 from csas_shadow_ros.bags import read_run
 from csas_shadow_ros.core.geometry import Track
+from csas_shadow_ros.core.imaging.subaperture import SubApertures
 from csas_shadow_ros.core.pipeline import Result, run
 from csas_shadow_ros.nodes import qos
 from csas_shadow_ros.nodes.bag_recorder import BagRecorderNode
@@ -33,6 +34,7 @@ from msg_adapters import (
     sector_to_msgs,
     topic,
     track_to_msg,
+    view_to_msgs,
     voxel_grid_from_msgs,
 )
 
@@ -224,6 +226,44 @@ def test_each_run_is_recorded_into_a_bag_of_its_own_that_leaves_the_same_grid_ag
         np.testing.assert_array_equal(again.grid.likelihood, expected.grid.likelihood)
         assert again.dimensions == expected.dimensions
     assert not (tmp_path / "mission_3").exists()
+
+
+def test_a_view_that_comes_before_its_track_is_recorded_into_its_own_run_s_bag(
+    graph: Graph, contacts: list[SimulatedRun], tmp_path: Path
+) -> None:
+    """A recorder that has just begun again hears views of the next run before that run's track."""
+    out = tmp_path / "mission"
+    recorder = graph.add(BagRecorderNode, out=str(out))
+    node = graph.plain_node("vehicle")
+
+    def publisher(name: str, profile: Any) -> Any:
+        return node.create_publisher(MESSAGES.cls(topic(name).type_name), name, profile)
+
+    track = publisher("track", qos.LATCHED)
+    views = [publisher(f"sub_aperture/{part}", qos.VIEWS) for part in ("image", "camera_info")]
+    graph.spin_until(lambda: all(p.get_subscription_count() for p in (track, *views)))
+    made = [
+        SubApertures(one.image, one.track, PARAMETERS.sub_aperture).view_of_aspect(0.0)
+        for one in contacts[:2]
+    ]
+
+    def send(view: Any) -> None:
+        for one, message in zip(views, view_to_msgs(MESSAGES, view, "sub_aperture"), strict=True):
+            one.publish(message)
+
+    track.publish(track_to_msg(MESSAGES, contacts[0].track))
+    graph.spin_until(lambda: recorder.counts["written"] >= 1)
+    send(made[0])
+    graph.spin_until(lambda: recorder.counts["integrated"] == 1)
+    send(made[1])
+    graph.spin_until(lambda: recorder.waiting_for_tracks() == 2, what="both its messages wait")
+    track.publish(track_to_msg(MESSAGES, contacts[1].track))
+    graph.spin_until(lambda: recorder.counts["integrated"] == 2)
+    recorder.stop()
+    for path, view in zip((out, tmp_path / "mission_2"), made, strict=True):
+        bag = read_run(path)
+        assert bag.counts["sub_aperture"] == 1
+        assert [one.info.stamp_ns for one in bag.views("sub_aperture")] == [view.info.stamp_ns]
 
 
 @pytest.mark.parametrize("image_first", [True, False])

@@ -80,6 +80,8 @@ NAMESPACE = "csas"
 BEAT_S = 0.5
 _LOG_EVERY_S = 10.0
 _MAX_KINDS = 32
+#: So many views are known again if they come twice: as many as the kept reports (`qos.REPORTS`).
+_REMEMBERED = 4096
 _LONELY_S = 5.0
 #: How soon a node that nothing happens to notices that it is told to stop.
 _STOP_S = 0.05
@@ -915,7 +917,7 @@ class Inlet:
             self.refuse(stamp, info, str(error))
             return
         self._seen[stamp] = None
-        if len(self._seen) > 1 << 16:
+        if len(self._seen) > _REMEMBERED:
             self._seen.pop(next(iter(self._seen)))
         if outcome is not None:
             self.report(stamp, outcome)
