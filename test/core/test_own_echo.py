@@ -59,13 +59,13 @@ def carved(mesh, monkeypatch):
         PROFILE, mesh, seed=3, heading_deg=25.0, faults=Faults(contrast_db=15.0), echo_db=6.0, workers=1
     )
     bare = []
-    given_back = Carver._given_back
+    given_back = Carver.given_back
 
     def watched(self, body, *args):
         bare.append(body)
         return given_back(self, body, *args)
 
-    monkeypatch.setattr(Carver, "_given_back", watched)
+    monkeypatch.setattr(Carver, "given_back", watched)
     parameters = PipelineParameters(
         sub_aperture=SubApertureParameters(step_deg=6.0),
         carving=CarvingParameters(voxel_size_m=VOXEL_M),

@@ -411,8 +411,6 @@ class Carver:
         self._pool = pool
         self._sums = _Sums(volume, pool)
         self._masks: dict[int, KeptMask] = {}
-        #: The body of `grid` before lit pixels on its plan gave anything back.
-        self._bare: VoxelGrid | None = None
         #: Stamps of the views that have been integrated.
         self.stamps: set[int] = set()
 
@@ -505,10 +503,7 @@ class Carver:
         if slope is not None and slope.believed:
             carver = self._over(slope)
             first = carver.first_look()
-        if not first.occupied.any():
-            return replace(first, seabed=slope)
-        self._bare = replace(carver._shape(first), seabed=slope)
-        return replace(carver._given_back(self._bare, first), seabed=slope)
+        return replace(carver._shape(first) if first.occupied.any() else first, seabed=slope)
 
     def _slope(self, first: VoxelGrid) -> SeabedSlope | None:
         """Fit the seabed's slope to the far ends of all silhouettes."""
@@ -523,6 +518,11 @@ class Carver:
             if lowest <= v.z_m[-1]:
                 return None
         return slope
+
+    def _over_seabed_of(self, body: VoxelGrid) -> Carver:
+        """Carve the same masks again over the seabed that a body was carved over, where that slopes."""
+        slope = body.seabed
+        return self if slope is None or not slope.believed else self._over(slope)
 
     def _over(self, slope: SeabedSlope) -> Carver:
         """Carve the same masks again, over a seabed that slopes."""
@@ -572,25 +572,35 @@ class Carver:
         likelihood = np.where(keep, fuller.likelihood, np.fmax(leaner.likelihood, fuller.likelihood))
         return thresholded(self.volume, likelihood, fuller.views, self.parameters)
 
-    def _given_back(
-        self, body: VoxelGrid, first: VoxelGrid, others: Sequence[VoxelGrid] = ()
-    ) -> VoxelGrid:
+    def given_back(self, body: VoxelGrid, others: Sequence[VoxelGrid] = ()) -> VoxelGrid:
         """Give back to a body what only lit pixels on its own plan took from it, where these speak for that.
 
         They may be seabed, seen in a hollow or under an overhang, or the echo of a side that slopes down to
         the seabed, or speckle on a top. Two signs tell that they are echo: with what they took, the body
         explains shadow that it leaves unexplained without; or they took much from under it, and few views
         contradict that.
+
+        Parameters
+        ----------
+        body : VoxelGrid
+            The body that `grid` or `beside` carved.
+        others : sequence of VoxelGrid
+            The other bodies of the scene.
+
+        Returns
+        -------
+        VoxelGrid
+            `body` itself where nothing is given back.
         """
         count = int(np.count_nonzero(body.occupied))
-        if not count:
+        if not count or not self._masks:
             return body
         below = _columns_filled(body.occupied) & ~body.occupied
         undercut = np.count_nonzero(below) >= _UNDERCUT * count
         unexplained, lit = self._misfit([body, *others])
         if not undercut and not unexplained >= _EXPLAINED:
             return body
-        whole = self._on_own_plan(body, first)
+        whole = self._over_seabed_of(body)._clear_of(others)._on_own_plan(body)
         if whole is None:
             return body
         if unexplained >= _EXPLAINED:
@@ -611,7 +621,7 @@ class Carver:
         known = shares[np.isfinite(shares).all(axis=1)]
         return (float(known[:, 0].mean()), float(known[:, 1].mean())) if len(known) else (math.nan, math.nan)
 
-    def _on_own_plan(self, body: VoxelGrid, first: VoxelGrid) -> VoxelGrid | None:
+    def _on_own_plan(self, body: VoxelGrid) -> VoxelGrid | None:
         """Add to a body what carving leaves on its plan if lit pixels on that say nothing."""
         v = self.volume
         sides = in_order(
@@ -620,7 +630,7 @@ class Carver:
         plan = plan_of_sides([found for _, found in sides if found is not None], v)
         if plan is None:
             return None
-        top = int(np.flatnonzero(first.occupied.any(axis=(1, 2)))[-1])
+        top = int(np.flatnonzero(body.occupied.any(axis=(1, 2)))[-1])
         height = float(v.z_m[top]) + v.voxel_size_m / 2.0
 
         def cleared(kept: KeptMask) -> KeptMask:
@@ -633,7 +643,7 @@ class Carver:
         """Add some voxels of another body to one."""
         likelihood = np.where(voxels, other.likelihood, body.likelihood)
         views = np.where(voxels, other.views, body.views)
-        return thresholded(self.volume, likelihood, views, self.parameters)
+        return replace(thresholded(self.volume, likelihood, views, self.parameters), seabed=body.seabed)
 
     def shadow_fits(self, grids: Sequence[VoxelGrid]) -> dict[int, ShadowFit]:
         """Compare the carving silhouettes with bodies' shadows, its own body's first, by stamp.
@@ -655,22 +665,20 @@ class Carver:
         """Threshold the voxels carved so far, with covered pixels unknown: the start of `grid`."""
         return thresholded(self.volume, self.likelihood(), self._sums.count, self.parameters)
 
-    def beside(self, alone: VoxelGrid, others: Sequence[VoxelGrid]) -> VoxelGrid:
+    def beside(self, leaner: VoxelGrid, others: Sequence[VoxelGrid]) -> VoxelGrid:
         """Add to `grid` the voxels that shadows require once the other bodies are known.
 
         Taken for unknown, pixels that other bodies' echoes may cover leave an apron between near ones. Taken
         for lit seabed they carve. What shadows ask for of the difference stays.
         """
-        leaner = self._bare or alone
         slope = leaner.seabed
-        carver = self if slope is None or not slope.believed else self._over(slope)
+        carver = self._over_seabed_of(leaner)
         cleared = carver._clear_of(others)
         if cleared is carver:
-            return alone
+            return leaner
         first = cleared.first_look()
         fuller = cleared._shape(first) if first.occupied.any() else first
-        body = carver._asked_for(leaner, fuller, others)
-        return replace(cleared._given_back(body, first, others), seabed=slope)
+        return replace(carver._asked_for(leaner, fuller, others), seabed=slope)
 
     def _clear_of(self, others: Sequence[VoxelGrid]) -> Carver:
         """Carve the same masks again, lit pixels that other bodies' echoes may cover as unknown.

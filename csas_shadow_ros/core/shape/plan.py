@@ -35,8 +35,11 @@ _INSIDE_CELLS = 0.5
 _RESPONSE_CELLS = (3.0, 2.0)
 #: Directions that a plan's sides face.
 _DIRECTIONS = 120
-#: Fewer directions that are bounded than this share of the circle bound no plan.
-_LEAST_BOUNDED = 0.5
+#: Sides that lie beyond the carved volume are those of other bodies, whose shadows touch this one's. The plan
+#: is known if the others bound it in this share of all directions. Of the population's bodies they do so in
+#: 0.78 to 1, of a frame in its laying grid in 0.41: at half that swells eightfold, at 0.8 a wedge stays lost
+#: (IoU 0.13 for 0.79).
+_LEAST_BOUNDED = 0.6
 
 
 @dataclass(frozen=True)
@@ -146,7 +149,9 @@ def plan_of_sides(sides: Sequence[ShadowSides], volume: Volume) -> FloatArray | 
     near = _beside(told[:, 0], faces, told[:, 3])
     opposite = _beside(told[:, 0] + math.pi, faces, told[:, 3])
     support = np.fmax(_medians(told[:, 1], near), _medians(told[:, 2], opposite)) - inside
-    bounded = np.isfinite(support)
+    half_x, half_y = (0.5 * size for size in volume.size_m[:2])
+    with np.errstate(invalid="ignore"):
+        bounded = support <= half_x * np.abs(np.cos(faces)) + half_y * np.abs(np.sin(faces))
     if float(bounded.mean()) < _LEAST_BOUNDED:
         return None
     return _outline(faces[bounded], support[bounded], volume)
