@@ -411,6 +411,8 @@ class Carver:
         self._pool = pool
         self._sums = _Sums(volume, pool)
         self._masks: dict[int, KeptMask] = {}
+        #: The last comparison of `shadow_fits`, by its bodies and the number of views.
+        self._fits: tuple[tuple[Sequence[VoxelGrid], int], dict[int, ShadowFit]] | None = None
         #: Stamps of the views that have been integrated.
         self.stamps: set[int] = set()
 
@@ -650,6 +652,13 @@ class Carver:
 
         Empty for methods that keep no silhouettes (soft, hard).
         """
+        asked = tuple(grids), len(self._masks)
+        if self._fits is None or self._fits[0] != asked:  # bodies are equal only to themselves
+            self._fits = asked, self._compared(grids)
+        return self._fits[1]
+
+    def _compared(self, grids: Sequence[VoxelGrid]) -> dict[int, ShadowFit]:
+        """Compare the silhouettes with bodies' shadows, whoever asked before."""
         seabed = grids[0].seabed
 
         def fit(kept: KeptMask) -> ShadowFit:
