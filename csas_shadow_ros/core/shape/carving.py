@@ -54,13 +54,18 @@ _SHADOW, _LIT, _NOTHING, _MIXED = 0, 1, 2, 3
 #: What an unknown pixel adds to the sums over a mask; blocks of more pixels than that are not looked up.
 _UNKNOWN = 1 << 16
 #: With what lit pixels on its plan took, a body must explain so much more of the segmented shadow (share,
-#: mean over the views).
+#: mean over the views). Of 19 bodies of the population's development half a stack gains 0.27 of IoU at half
+#: of it, a wedge loses 0.66 at double. A measured vehicle (docs/examples.md) would explain 0.024 more.
 _EXPLAINED = 0.05
-#: For each pixel that it explains more, so many may be lit.
+#: For each pixel that it explains more, so many may be lit. At half a wedge loses 0.66, at double nothing
+#: changes; a table would need 4.2.
 _LIT_FOR_IT = 2.0
-#: Or they took at least so much from under the body (share of its voxels), and most of it is contradicted by
-#: less than this share of its views.
-_UNDERCUT, _SELDOM = 0.1, 0.1
+#: Or they took so much from under the body (share of its voxels) at least. At half nothing changes, at double
+#: a keg loses 0.09.
+_UNDERCUT = 0.1
+#: And less than this share of its views contradicts most of that. At half a tyre, a crate and an L plan lose
+#: 0.2 to 0.3 each, at double a rock with an overhang loses 0.13.
+_SELDOM = 0.1
 _NOWHERE = np.empty((0, 0), np.bool_)
 
 
