@@ -29,8 +29,8 @@ FloatArray = NDArray[np.float64]
 #: down-range): speckle roughens it, and a body's own corners are broader.
 _MEDIAN_HALF_CELLS = 1.2
 #: The plan lies so far inside of what the sides bound (resolution cells across): the looks of an aperture see
-#: past the ends of a flat side. Of 19 bodies of the population's development half (mean IoU 0.753) none changes
-#: by more than 0.04 at half; at double the mean is 0.729, as a pipe loses 0.3.
+#: past the ends of a flat side. Of 19 bodies of the population's development half (mean IoU 0.753) none
+#: changes by more than 0.04 at half; at double the mean is 0.729, as a pipe loses 0.3.
 _INSIDE_CELLS = 0.5
 #: The body's echo may show so many resolution cells beyond its plan, down-range and across. At half the mean
 #: of the same bodies is 0.747, at double 0.758.
