@@ -166,6 +166,18 @@ def test_sides_that_leave_nothing_between_them_bound_no_plan():
     assert plan_of_sides(sides, VOLUME) is None
 
 
+def test_sides_beyond_the_volume_are_not_the_bodys_and_bound_no_plan():
+    # The shadows of its neighbours touch this body's in most directions.
+    def plan(share):
+        angles = np.radians(np.arange(0.0, 360.0, 6.0))
+        reach = np.where(np.mod(angles, math.pi) < share * math.pi, 0.9, 0.2)
+        sides = [ShadowSides(t, r, r, 0.2, 0.02) for t, r in zip(angles, reach, strict=True)]
+        return plan_of_sides(sides, VOLUME)
+
+    assert plan(0.2) is not None
+    assert plan(0.6) is None
+
+
 def test_columns_stand_on_a_plan():
     corners = np.array([[-0.2, -0.1], [0.3, -0.1], [0.3, 0.25], [-0.2, 0.25]])
     x, y = VOLUME.x_m, VOLUME.y_m
