@@ -166,10 +166,23 @@ class Body:
         self, alone: tuple[VoxelGrid, VoxelGrid | None], others: Sequence[VoxelGrid]
     ) -> tuple[VoxelGrid, VoxelGrid | None]:
         """Return `shape` again, given `alone` and the other bodies."""
-        told, other = alone
-        if other is not None and told.method != self.carver.parameters.method:
-            told, other = other, told
-        return self._told(self.carver.beside(told, others), other)
+        own, other = self._own_first(alone)
+        return self._told(self.carver.beside(own, others), other)
+
+    def given_back(
+        self, carved: tuple[VoxelGrid, VoxelGrid | None], others: Sequence[VoxelGrid]
+    ) -> tuple[VoxelGrid, VoxelGrid | None]:
+        """Return what was carved with what only lit pixels on its own plan took (`Carver.given_back`)."""
+        own, other = self._own_first(carved)
+        return self._told(self.carver.given_back(own, others), other)
+
+    def _own_first(
+        self, told: tuple[VoxelGrid, VoxelGrid | None]
+    ) -> tuple[VoxelGrid, VoxelGrid | None]:
+        grid, other = told
+        if other is not None and grid.method != self.carver.parameters.method:
+            return other, grid
+        return grid, other
 
     def _told(self, own: VoxelGrid, other: VoxelGrid | None) -> tuple[VoxelGrid, VoxelGrid | None]:
         silhouettes = self.carver.parameters.takes_masks
@@ -500,7 +513,8 @@ class Reconstruction:
     def _shapes(self) -> dict[int, tuple[VoxelGrid, VoxelGrid | None]]:
         """Return the grid of each body by its number, and by the other method where it was asked for.
 
-        Where there are several objects each is carved again without what the others' echoes may cover.
+        Where there are several objects each is carved again without what the others' echoes may cover. What a
+        body's own echo may have taken comes back once the others are known.
         """
         usable = {n: body for n, body in enumerate(self.bodies) if body.carver.stamps and not body.given_up}
         shapes = {n: body.shape() for n, body in usable.items()}
@@ -509,10 +523,12 @@ class Reconstruction:
             told = [one for found in objects.values() for one in found]
             objects[n] = objects_of(grid, self.bodies[n].target.position_m, told)[0] if n else [grid]
         # What falls to pieces, or is a phantom in part, gets no more: shadows of others would ask for it.
-        for n in [n for n, found in objects.items() if any(one is shapes[n][0] for one in found)]:
-            others = [one for other, found in objects.items() if other != n for one in found]
-            if others:
-                shapes[n] = usable[n].beside(shapes[n], others)
+        whole = [n for n, found in objects.items() if any(one is shapes[n][0] for one in found)]
+        others = {n: [one for m, found in objects.items() if m != n for one in found] for n in whole}
+        for n in whole:
+            if others[n]:
+                shapes[n] = usable[n].beside(shapes[n], others[n])
+            shapes[n] = usable[n].given_back(shapes[n], others[n])
         return shapes
 
     @staticmethod

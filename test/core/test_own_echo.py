@@ -1,0 +1,207 @@
+"""Lit sides that slope down to the seabed do not carve their own body; seabed seen under one still does."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from core_data import hidden_by_box, iou, make_info, perfect_views
+
+from csas_shadow_ros.core.geometry import View
+from csas_shadow_ros.core.imaging.mask_codes import MASK_SHADOW
+from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
+from csas_shadow_ros.core.pipeline import run
+from csas_shadow_ros.core.shape.carving import Carver, carve
+from csas_shadow_ros.core.shape.layover import layover_per_metre
+from csas_shadow_ros.core.shape.plan import (
+    ShadowSides,
+    echo_of_plan,
+    on_plan,
+    plan_of_sides,
+    shadow_sides,
+)
+from csas_shadow_ros.core.shape.volume import Volume
+from csas_shadow_ros.simulation import Faults, Profile, shadow_hull, simulate
+from csas_shadow_ros.simulation.bodies import brick, convex
+from csas_shadow_ros.simulation.targets import join_bodies
+
+PROFILE = Profile(
+    name="coarse",
+    rows=512,
+    cols=512,
+    spacing_m=0.016,
+    radius_m=34.0,
+    height_m=21.4,
+    centre_frequency_hz=21.3e3,
+    bandwidth_hz=7.5e3,
+    block_deg=1.0,
+    edge_m=0.064,
+)
+VOXEL_M = 0.13
+
+
+def wedge():
+    """Make a body that slopes down to the seabed at one end, 17° against the 32° of the sonar."""
+    low = [(x, y, 0.0) for x in (-1.1, 1.1) for y in (-0.9, 0.9)]
+    return convex([*low, (-1.1, -0.9, 0.7), (-1.1, 0.9, 0.7)])
+
+
+def table():
+    """Make a slab on four legs."""
+    legs = [brick((0.18, 0.18, 0.8), (sx * 0.9, sy * 0.5, 0.0)) for sx in (-1, 1) for sy in (-1, 1)]
+    return join_bodies([*legs, brick((2.0, 1.2, 0.2), (0.0, 0.0, 0.8))])
+
+
+def carved(mesh, monkeypatch):
+    """Return the grid of a simulated body, the one that nothing was given back to, and its shadow hull."""
+    simulated = simulate(
+        PROFILE, mesh, seed=3, heading_deg=25.0, faults=Faults(contrast_db=15.0), echo_db=6.0, workers=1
+    )
+    bare = []
+    given_back = Carver.given_back
+
+    def watched(self, body, *args):
+        bare.append(body)
+        return given_back(self, body, *args)
+
+    monkeypatch.setattr(Carver, "given_back", watched)
+    parameters = PipelineParameters(
+        sub_aperture=SubApertureParameters(step_deg=6.0),
+        carving=CarvingParameters(voxel_size_m=VOXEL_M),
+    )
+    grid = run(simulated.image, simulated.track, parameters, workers=1).grid
+    hull = shadow_hull(
+        simulated.truth.target, simulated.truth.sonar_m[::3], grid.volume, spacing_m=VOXEL_M / 8.0
+    )
+    return grid, bare[0], hull
+
+
+def test_a_side_that_slopes_down_to_the_seabed_does_not_carve_its_body(monkeypatch):
+    grid, bare, hull = carved(wedge(), monkeypatch)
+    assert iou(bare.occupied, hull) < 0.4
+    assert iou(grid.occupied, hull) > 0.8
+
+
+def test_seabed_that_is_seen_under_a_slab_still_carves(monkeypatch):
+    grid, bare, _ = carved(table(), monkeypatch)
+    assert np.array_equal(grid.occupied, bare.occupied)
+    assert np.array_equal(grid.likelihood, bare.likelihood, equal_nan=True)
+
+
+# The plan
+
+LOW, HIGH = (-0.35, -0.2, 0.0), (0.35, 0.2, 0.3)
+VOLUME = Volume.around((0.0, 0.0), (1.0, 0.8, 0.5), 0.025)
+INFOS = tuple(make_info(math.radians(a), size=256, spacing_m=0.01) for a in range(0, 360, 6))
+
+
+def hidden(x, y, sonar_m):
+    return hidden_by_box(x, y, sonar_m, LOW, HIGH)
+
+
+@pytest.fixture(scope="module")
+def box():
+    """Return the silhouettes of a box without its echo, and what they carve."""
+    masks = perfect_views(hidden, INFOS, "mask")
+    return masks, carve(list(masks), VOLUME, CarvingParameters())
+
+
+def plan_of(masks, body):
+    sides = [shadow_sides(mask, body, VOLUME.centre_m[:2]) for mask in masks]
+    return plan_of_sides([one for one in sides if one is not None], VOLUME)
+
+
+def test_the_sides_of_shadows_bound_the_plan(box):
+    masks, body = box
+    cell = INFOS[0].resolution_m[1]
+    for mask in masks[::7]:
+        side = shadow_sides(mask, body, (0.0, 0.0))
+        reach = [HIGH[0] * abs(math.cos(side.direction_rad)) + HIGH[1] * abs(math.sin(side.direction_rad))]
+        assert np.allclose([side.right_m, side.left_m], reach, atol=0.7 * cell)
+    low, high = plan_of(masks, body).min(axis=0), plan_of(masks, body).max(axis=0)
+    assert np.allclose(low, LOW[:2], atol=cell)
+    assert np.allclose(high, HIGH[:2], atol=cell)
+
+
+def test_a_shadow_that_is_not_the_bodys_is_no_side_of_it(box):
+    masks, body = box
+    right = shadow_sides(masks[0], body, (0.0, 0.0))
+    pixels = masks[0].pixels.copy()
+    pixels[:, :20] = MASK_SHADOW
+    assert shadow_sides(View(INFOS[0], pixels), body, (0.0, 0.0)) == right
+    pixels[:] = 0
+    assert shadow_sides(View(INFOS[0], pixels), body, (0.0, 0.0)) is None
+
+
+@pytest.mark.parametrize("wrong_m", [0.05, 0.6])
+def test_a_few_wrong_views_move_no_side(wrong_m):
+    # A third of those within half an aperture of each direction.
+    angles = np.radians(np.arange(0.0, 360.0, 2.0))
+    reach = [wrong_m if n % 3 == 0 else 0.3 for n in range(len(angles))]
+    sides = [ShadowSides(t, r, r, 0.2, 0.02) for t, r in zip(angles, reach, strict=True)]
+    assert np.allclose(np.hypot(*plan_of_sides(sides, VOLUME).T), 0.29, atol=0.01)
+
+
+def test_the_wider_of_opposite_views_counts():
+    def plan(narrow_from, narrow_to):
+        sides = [
+            ShadowSides(t, *((0.1, 0.1) if narrow_from <= t < narrow_to else (0.3, 0.3)), 0.2, 0.02)
+            for t in np.radians(np.arange(0.0, 360.0, 6.0))
+        ]
+        return np.hypot(*plan_of_sides(sides, VOLUME).T)
+
+    assert np.allclose(plan(0.0, math.pi), 0.29, atol=0.01)
+    assert plan(0.0, 2.0 * math.pi).max() < 0.1
+
+
+@pytest.mark.parametrize("arc_deg", [0.0, 60.0])
+def test_no_sides_or_a_short_arc_of_them_bound_no_plan(arc_deg):
+    sides = [ShadowSides(t, 0.3, 0.3, 0.2, 0.02) for t in np.radians(np.arange(0.0, arc_deg, 6.0))]
+    assert plan_of_sides(sides, VOLUME) is None
+
+
+def test_sides_that_leave_nothing_between_them_bound_no_plan():
+    sides = [ShadowSides(t, -0.2, -0.2, 0.2, 0.02) for t in np.radians(np.arange(0.0, 360.0, 6.0))]
+    assert plan_of_sides(sides, VOLUME) is None
+
+
+def test_sides_beyond_the_volume_are_not_the_bodys_and_bound_no_plan():
+    # The shadows of its neighbours touch this body's in most directions.
+    def plan(share):
+        angles = np.radians(np.arange(0.0, 360.0, 6.0))
+        reach = np.where(np.mod(angles, math.pi) < share * math.pi, 0.9, 0.2)
+        sides = [ShadowSides(t, r, r, 0.2, 0.02) for t, r in zip(angles, reach, strict=True)]
+        return plan_of_sides(sides, VOLUME)
+
+    assert plan(0.2) is not None
+    assert plan(0.6) is None
+
+
+def test_columns_stand_on_a_plan():
+    corners = np.array([[-0.2, -0.1], [0.3, -0.1], [0.3, 0.25], [-0.2, 0.25]])
+    x, y = VOLUME.x_m, VOLUME.y_m
+    inside = ((y > -0.1) & (y < 0.25))[:, None] & ((x > -0.2) & (x < 0.3))
+    assert np.array_equal(on_plan(corners, VOLUME), inside)
+
+
+@pytest.mark.parametrize("info", INFOS[::11])
+def test_what_stands_on_a_plan_is_imaged_on_its_echo(info):
+    corners = np.array([[-0.2, -0.1], [0.3, -0.1], [0.3, 0.25], [-0.2, 0.25]])
+    zone = echo_of_plan(info, corners, 0.4)
+    camera = info.camera
+
+    def at(x, y, z):
+        ground = np.array([x, y]) + z * layover_per_metre(info)
+        u, v = camera.ground_to_pixel[:2, :2] @ ground + camera.ground_to_pixel[:2, 2]
+        return zone[round(v), round(u)]
+
+    assert all(at(x, y, z) for x, y in corners for z in (0.0, 0.2, 0.4))
+    behind = -0.7 * layover_per_metre(info) / np.linalg.norm(layover_per_metre(info))
+    assert not at(*(corners.mean(axis=0) + behind), 0.0)
+    assert not at(*(corners.mean(axis=0) - behind), 0.4)
+    # Three cells down-range and two across beyond the plan itself.
+    alone = echo_of_plan(info, corners, 0.0)
+    cells = alone.sum() * np.prod(camera.spacing_m)
+    down, across = np.array(info.resolution_m) * (6.0, 4.0)
+    assert 0.5 * 0.35 < cells < (0.61 + down) * (0.61 + across)
