@@ -54,17 +54,18 @@ def assert_same_grid(result: module.ReplayResult, reference: Reference) -> None:
 
 
 def test_a_replay_whose_recorder_may_write_no_more_ends_with_its_grid_and_says_what_is_not_recorded(
-    run_bag: Path, reference: Reference, tmp_path: Path, graphs: list[Any]
+    run_bag: Path, reference: Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Real writes that really fail, as on a full disk: the system lets this process' files grow no further.
     limit = 1 << 20
-    began: list[int] = []
+    enter = module.Graph.__enter__
 
-    def forbid(done: int, total: int) -> None:
-        if not began:
-            began.append(done)
-            resource.prlimit(graphs[-1].processes["bag_recorder"].pid, resource.RLIMIT_FSIZE, (limit, limit))
+    def entered(graph: Any) -> Any:
+        made = enter(graph)
+        resource.prlimit(graph.processes["bag_recorder"].pid, resource.RLIMIT_FSIZE, (limit, limit))
+        return made
 
+    monkeypatch.setattr(module.Graph, "__enter__", entered)
     waits = {"sink_wait_s": 2.0}
     result = replay(
         run_bag,
@@ -73,7 +74,7 @@ def test_a_replay_whose_recorder_may_write_no_more_ends_with_its_grid_and_says_w
         record=True,
         composites=False,
         overrides={"sub_aperture": waits, "bag_player": waits},
-        progress=forbid,
+        progress=False,
         stall_timeout_s=60.0,
     )
     assert_same_grid(result, reference)
