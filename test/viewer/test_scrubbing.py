@@ -82,6 +82,20 @@ def test_the_decoded_part_is_the_picture(watched: Any, serve: Any) -> None:
         assert part == whole
 
 
+def test_a_picture_that_is_asked_for_twice_at_once_comes_twice(watched: Any, serve: Any) -> None:
+    """By its address alone the first question would never be answered."""
+    watched.open(serve(store_of_slopes()))
+    watched.until("csas.loader.filled")
+    sizes = watched.page.evaluate(
+        "async () => { const a = csas.address('shadow', csas.views('shadow')[20], 'jpg');"
+        " const twice = Promise.all([csas.loader.pixels(a), csas.loader.pixels(a)]);"
+        " const made = await Promise.race([twice, new Promise((done) => setTimeout(() => done([]), 10000))]);"
+        " return made.map((one) => one.codes.length); }"
+    )
+    assert len(sizes) == 2
+    assert sizes[0] == sizes[1] > 0
+
+
 def test_no_more_is_decoded_ahead_than_there_is_room_for(watched: Any, serve: Any) -> None:
     watched.open(serve(store_of_slopes()))
     watched.js("csas.loader.room = 200000, csas.dirty()")

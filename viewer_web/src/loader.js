@@ -16,7 +16,8 @@ export class Loader {
     this.changed = changed;
     this.partOf = partOf;
     this.decoders = Array.from({ length: DECODES }, startWorker);
-    this.answers = new Map(); // address → what to do with its pixels
+    this.answers = new Map(); // number of a question → what to do with its pixels: one address may be asked twice
+    this.asked = 0;
     for (const each of this.decoders) each.onmessage = ({ data }) => this.answers.get(data.id)(data);
     this.blobs = new Map(); // address → Blob
     this.bitmaps = new Map(); // address → { width, height, codes, part } or ImageBitmap (colours), least recently used first
@@ -135,11 +136,12 @@ export class Loader {
     if (COLOURS.test(a)) return Object.assign(await (part ? createImageBitmap(blob, ...part) : createImageBitmap(blob)), { part });
     const decoder = this.decoders.shift(); // no more are busy than there are
     this.decoders.push(decoder);
+    const id = ++this.asked;
     const answer = await new Promise((done) => {
-      this.answers.set(a, done);
-      decoder.postMessage({ do: "decode", id: a, blob, part });
+      this.answers.set(id, done);
+      decoder.postMessage({ do: "decode", id, blob, part });
     });
-    this.answers.delete(a);
+    this.answers.delete(id);
     if (!answer.codes) throw new Error(`${a} is no picture`);
     return answer;
   }
