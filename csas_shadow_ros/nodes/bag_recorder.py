@@ -29,11 +29,11 @@ from .runtime.runs import HOLD_S
 
 #: Topics of messages that differ though they carry the same stamp.
 _NEVER_ALIKE = frozenset({"progress", "/diagnostics"})
-#: A run's result stays published until the next one has these to say; then its bag is finished.
 #: What is said once for all runs to come, whenever: each bag has it, as far as it is known.
 _STANDING = frozenset({"origin", "scene_transform"})
 #: So many of them are kept: a mission says it anew for each contact.
 _MOST_STANDING = 16
+#: A run's result stays published until the next one has these to say; then its bag is finished.
 _ENDS_THE_RUN_BEFORE = frozenset({"measurements", "voxel_grid/image"})
 #: Bags of one recorder, at most.
 _MOST_RUNS = 10_000
@@ -416,10 +416,6 @@ class BagRecorderNode(CsasNode):
             if isinstance(inlet, RecordingInlet):
                 inlet.report_taken_over()
 
-    def waiting_for_tracks(self) -> int:
-        """Return how many messages wait for the track of their run."""
-        return len(self._unplaced)
-
     def state_values(self) -> dict[str, str]:
         """Return the recorded run, its bag, and the latched topics that this has messages of."""
         if not self._bags:
@@ -428,6 +424,10 @@ class BagRecorderNode(CsasNode):
         # Heartbeats ask from a thread of their own, while the set grows: it is copied in one step.
         values = {"bag": str(bag.path), "holds": " ".join(sorted(tuple(bag.latched)))}
         return values | ({} if bag.run_ns is None else {"run": str(bag.run_ns)})
+
+    def state_counts(self) -> dict[str, int]:
+        """Count the messages that wait for the track of their run."""
+        return {"waiting_for_track": len(self._unplaced)}
 
     def tick(self) -> None:
         """Flush the bag against a crash; record further objects' topics as they appear."""

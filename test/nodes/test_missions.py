@@ -256,7 +256,7 @@ def test_a_view_that_comes_before_its_track_is_recorded_into_its_own_run_s_bag(
     send(made[0])
     graph.spin_until(lambda: recorder.counts["integrated"] == 1)
     send(made[1])
-    graph.spin_until(lambda: recorder.waiting_for_tracks() == 2, what="both its messages wait")
+    graph.spin_until(lambda: recorder.state_counts()["waiting_for_track"] == 2, what="both its messages wait")
     track.publish(track_to_msg(MESSAGES, contacts[1].track))
     graph.spin_until(lambda: recorder.counts["integrated"] == 2)
     recorder.stop()

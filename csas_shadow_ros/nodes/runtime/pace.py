@@ -105,7 +105,7 @@ class Growing:
             silent_s, same_s = now - self._source_s, now - self._changed_s
             rests = silent_s > SOURCE_SILENT_S and same_s > IDLE_S
             self.final = rests and self._is_gone(silent_s, same_s)
-            quiet = now - self._changed_s > _QUIET_S
+            quiet = same_s > _QUIET_S
             due = now - self._published_s > max(self.period_s, 0.0 if quiet else 10.0 * self._cost_s)
             if self.final or (self._dirty and (rests or (due and self._wanted()))):
                 self._do(now)
