@@ -127,3 +127,14 @@ def test_a_list_that_holds_nothing_new_is_told_as_filled(watched: Any, serve: An
         " csas.loader.fetchAll([...csas.loader.blobs.keys()]); })()"
     )
     assert watched.js("csas.loader.told") == 1
+
+
+def test_a_circle_that_has_no_room_yet_draws_nothing_and_says_nothing(watched: Any, serve: Any) -> None:
+    """A small screen lays its pictures out after the first evidence has come."""
+    watched.open(serve(store_of_slopes()))
+    watched.until("csas.loader.filled")
+    watched.js(
+        "(() => { const s = csas.panels[0].slider, side = s.side;"
+        " s.evidence = { heights: [[0, 0.3, 0.1]], median: 0.3, refused: [], worst: 1 };"
+        " s.side = 0; s.background = undefined; s.drawRing(); s.side = side; s.evidence = null; })()"
+    )

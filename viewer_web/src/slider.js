@@ -262,6 +262,7 @@ export class CsasSlider extends HTMLElement {
   // A bar a view, inwards from the circle: half of the room is the run's median height; the redder, the more of
   // the view's shadow is not explained by what was found, or lies on seabed that is lit.
   drawEvidence(g, k) {
+    if (!this.disc) return; // not laid out yet: there is no ring to draw on
     const { heights, median } = this.evidence, outer = this.radius - 4 * this.em, room = outer - this.disc - this.em;
     const half = (this.step / 720) * TAU * 0.9;
     for (const [aspect, height, unexplained, lit] of heights) {
