@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
+from .equality import equal_where_nan
 from .errors import ParameterError
 from .methods import METHODS, Method, method_named
 
@@ -286,6 +287,7 @@ VIEW_STAGES: tuple[Stage, ...] = get_args(Stage)
 START_FROM: tuple[StartFrom, ...] = get_args(StartFrom)
 
 
+@equal_where_nan
 @dataclass(frozen=True)
 class PlaceParameters(Parameters):
     """Place on earth: a datum, instead of topic origin."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..equality import equal_where_nan
 from ..errors import ParameterError, check_number, check_numbers
 from .frames import FloatArray
 
@@ -28,6 +29,7 @@ _E2 = _F * (2.0 - _F)
 _SIGMAS_95 = 1.959964
 
 
+@equal_where_nan
 @dataclass(frozen=True)
 class Place:
     """The place of an object on earth.

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..equality import equal_where_nan
 from ..errors import (
     GeometryError,
     check_finite,
@@ -25,6 +26,7 @@ from .frames import TWO_PI, Acoustics, FloatArray, GroundGrid, down_range_axis
 from .pixels import COHERENT, OF_A_VIEW, check_finite_pixels, check_pixels
 
 
+@equal_where_nan
 @dataclass(frozen=True)
 class ViewInfo:
     """Everything about a view except its pixels: the content of its ``CameraInfo``.

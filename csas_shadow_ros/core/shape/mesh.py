@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..equality import equal_where_nan
 from ..errors import NoTargetError
 from .volume import VoxelGrid
 
@@ -197,6 +198,7 @@ def _march_tetrahedra(
     return place + (first / (first - last))[:, None] * step, faces.reshape(-1, 3)
 
 
+@equal_where_nan
 @dataclass(frozen=True)
 class Dimensions:
     """Measures of an object.

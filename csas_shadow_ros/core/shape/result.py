@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..equality import equal_where_nan
 from ..geometry import SCENE_FRAME
 from ..methods import method_named
 from .mesh import Dimensions
@@ -48,6 +49,7 @@ class Quality:
     reasons: tuple[str, ...] = ()
 
 
+@equal_where_nan
 @dataclass(frozen=True)
 class ViewEvidence:
     """The contribution of one view.

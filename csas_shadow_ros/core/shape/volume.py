@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..equality import equal_where_nan
 from ..errors import (
     GeometryError,
     InputTypeError,
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 MARGIN_SHARE = 0.25
 
 
+@equal_where_nan
 @dataclass(frozen=True)
 class Target:
     """A body that the search found.
