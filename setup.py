@@ -109,16 +109,17 @@ def node_scripts() -> list[tuple[str, list[str]]]:
     """Make what ``ros2 run`` looks for when pip installs a wheel.
 
     pip ignores setup.cfg's install_scripts (which serves colcon) and puts console scripts into bin/;
-    ``ros2 run`` looks in lib/NAME. So a wheel carries one small script a node there.
+    ``ros2 run`` and the launch file look in lib/NAME. So a wheel carries one small script a node there,
+    and one for the command line.
     """
     if "bdist_wheel" not in sys.argv:
         return []
     folder = Path("build") / "ros2_run"
     folder.mkdir(parents=True, exist_ok=True)
     scripts = []
-    for node in NODES:
-        script = folder / node
-        script.write_text(f'#!/bin/sh\nexec "$(dirname "$0")/../../bin/{node}" "$@"\n', encoding="utf-8")
+    for name in ("csas-shadow", *NODES):
+        script = folder / name
+        script.write_text(f'#!/bin/sh\nexec "$(dirname "$0")/../../bin/{name}" "$@"\n', encoding="utf-8")
         script.chmod(0o755)
         scripts.append(str(script))
     return [(f"lib/{NAME}", scripts)]

@@ -30,7 +30,7 @@ from launch.actions import (
 )
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
-from launch_ros.substitutions import FindPackageShare
+from launch_ros.substitutions import ExecutableInPackage, FindPackageShare
 
 from csas_shadow_ros.node_table import chain
 from launch import LaunchDescription
@@ -139,7 +139,8 @@ def start(context):
 def replay(value):
     """Describe the process of a replay, and the launch's end with it."""
     results = value["results"] if value["results"] != "auto" else Path("results", Path(value["bag"]).name)
-    command = [sys.executable, "-m", f"{PACKAGE}.cli", "replay", value["bag"], "--out", str(results)]
+    # As nodes are found: the Python of ros2 itself, apt's, sees nothing of an environment beside it.
+    command = [ExecutableInPackage("csas-shadow", PACKAGE), "replay", value["bag"], "--out", str(results)]
     command += ["--overwrite", "--params", value["params"], "--rate", value["rate"]]
     command += ["--start-from", value["stage"]]
     for name in ("expect", "domain_id", "origin_lat_deg", "origin_lon_deg", "origin_heading_deg"):

@@ -79,7 +79,7 @@ def test_the_wheel_serves_ros2_run_and_the_ament_index(wheel):
     data = f"csas_shadow_ros-{csas_shadow_ros.__version__}.data/data"
     assert f"{data}/share/ament_index/resource_index/packages/csas_shadow_ros" in names
     assert f"{data}/share/csas_shadow_ros/package.xml" in names
-    for node in nodes():
+    for node in ("csas-shadow", *nodes()):
         script = wheel.getinfo(f"{data}/lib/csas_shadow_ros/{node}")
         assert (script.external_attr >> 16) & 0o111 == 0o111, f"{node} cannot be executed"
         assert wheel.read(script).decode() == f'#!/bin/sh\nexec "$(dirname "$0")/../../bin/{node}" "$@"\n'

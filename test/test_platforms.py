@@ -98,14 +98,16 @@ def test_the_constraints_of_noble_fit_what_is_required_and_what_apt_has() -> Non
     lines = (ROOT / "constraints" / "noble.txt").read_text().splitlines()
     given = {canonicalize_name(r.name): r for r in map(Requirement, (x for x in lines if x and x[0] != "#"))}
     apt = {canonicalize_name(name): version for name, _, version in NOBLE.values()}
-    assert set(given) <= set(CORE)
+    # matplotlib of that time warns beside a newer pyparsing, and a warning fails the tests.
+    assert set(given) <= {*CORE, "pyparsing"}
     # numpy's is the one that rclpy was built for, and numba's goes with it.
     assert {"numpy", "numba", "scipy", "opencv-python-headless", "matplotlib"} <= set(given)
     for name, constraint in given.items():
         if name in apt and name != "opencv-python-headless":  # the wheel's version has a fourth number
             assert constraint.specifier.contains(apt[name]), f"{constraint} is not apt's {apt[name]}"
         for pinned in (s.version for s in constraint.specifier if s.operator == "=="):
-            assert CORE[name].specifier.contains(pinned), f"{constraint} is refused by {CORE[name]}"
+            if name in CORE:
+                assert CORE[name].specifier.contains(pinned), f"{constraint} is refused by {CORE[name]}"
 
 
 def test_no_figure_asks_for_a_legend_that_matplotlib_3_6_cannot_place() -> None:

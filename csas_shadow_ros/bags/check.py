@@ -24,7 +24,15 @@ from msg_adapters.pairs import (
     view_from_msgs,
     voxel_grid_from_msgs,
 )
-from msg_adapters.topics import STREAMS, TOPICS, VIEW_STREAMS, VOXEL_STREAMS, absolute_name, split_prefix
+from msg_adapters.topics import (
+    STREAMS,
+    TOPICS,
+    VIEW_STREAMS,
+    VOXEL_STREAMS,
+    absolute_name,
+    is_topic,
+    split_prefix,
+)
 
 from .bag import BagReader
 from .pairs import Problem, first_of_alike, iterate_pairs
@@ -215,19 +223,28 @@ class _Check:
         """Turn what reading refused into a finding with a remedy."""
         relative = problem.topic.removeprefix(f"{self.reader.namespace}/")
         topic = TOPICS.get(relative)
+        level = ERROR
         if problem.number is None and problem.stamp_ns is not None:
             remedy = "Let all sectors share one band, hold it, and cover the same ground: they are added up."
         elif problem.number is None:
             remedy = f"Publish {problem.topic} as {topic.type_name}." if topic else ""
         elif "of the same stamp" in problem.reason and "has no" in problem.reason:
             remedy = "Give an image and its camera_info the very same header.stamp, and record both topics."
+            # ros2 bag record loses views: nothing needs them where the run can be made from its start.
+            if self.can_start() and not relative.startswith(("image", "camera_info", "sector/")):
+                level = WARNING
         elif "differs from an earlier" in problem.reason:
             remedy = "The stamp identifies a view: give every view a stamp of its own."
         else:
             remedy = f"Let the publisher of {problem.topic} send what docs/conventions.md expects."
         self.say(
-            ERROR, problem.topic, problem.reason, remedy, number=problem.number, stamp_ns=problem.stamp_ns
+            level, problem.topic, problem.reason, remedy, number=problem.number, stamp_ns=problem.stamp_ns
         )
+
+    def can_start(self) -> bool:
+        """Say whether a run can be made from image or sectors, as far as the bag was read."""
+        usable = self.report.usable
+        return "track" in usable and any(usable.get(s) for s in ("image", "sector"))
 
     def name(self, relative: str) -> str:
         return absolute_name(relative, self.reader.namespace)
@@ -254,8 +271,8 @@ class _Check:
             )
         if not reader.has_checksums and reader.message_count:
             self.say(INFO, "", "parts of the bag carry no checksum: changed bits would go unnoticed")
-        known = {absolute_name(t, reader.namespace) for t in TOPICS}
-        if others := sorted(set(reader.topics) - known):
+        below = f"{reader.namespace}/"
+        if others := sorted(t for t in reader.topics if not is_topic(t.removeprefix(below))):
             self.say(INFO, "", f"{len(others)} topics are not part of the contract: {', '.join(others[:8])}")
 
     def find_origin(self) -> None:

@@ -29,7 +29,8 @@ from .imaging.segmentation import require_silhouette
 from .parameters import PipelineParameters
 from .search.decision import Decision
 from .search.pieces import NOTHING_LEFT, objects_of
-from .shape.carving import Carver
+from .shape.carving import Carver, compared_shadows
+from .shape.explained import ShadowFit
 from .shape.hollows import EchoLook, matter_mesh, matter_of
 from .shape.measurement import (
     SilhouetteSides,
@@ -95,6 +96,8 @@ class Body:
         #: Nothing can be left of it any more: it takes no further views.
         self.given_up = False
         self._masks: dict[int, KeptMask] = {}
+        #: Silhouettes by which the result is judged, where the carver keeps none.
+        self._shown: dict[int, KeptMask] = {}
         self._waiting: OrderedDict[int, Levels] = OrderedDict()
 
     def add(self, view: ProcessedView, parts: Collection[str]) -> bool:
@@ -119,6 +122,8 @@ class Body:
                 self.looks[stamp] = view.look
         if mask is not None or levels is not None:
             self._take_sides(stamp, view, mask, levels)
+        if mask is not None and not self.carver.keeps_masks:
+            self._shown.setdefault(stamp, KeptMask.of(mask))
         fresh, errors = False, []
         for carver in (self.carver, self.other):
             pixels = None if carver is None else mask if carver.parameters.takes_masks else likelihood
@@ -189,6 +194,13 @@ class Body:
         if silhouettes and other is not None and other.occupied.any() and not own.occupied.any():
             return other, own
         return own, other
+
+    def shadow_fits(self, grids: Sequence[VoxelGrid]) -> dict[int, ShadowFit]:
+        """Compare the silhouettes with bodies' shadows, its own first, by stamp, whatever carved them."""
+        if self.carver.keeps_masks:
+            return self.carver.shadow_fits(grids)
+        used = {stamp: kept for stamp, kept in self._shown.items() if stamp in self.carver.stamps}
+        return compared_shadows(used, grids)
 
     def known_sides(self) -> list[SilhouetteSides]:
         """Return the sides of the views in the grid; of a silhouette that came alone it tells them itself."""
@@ -496,7 +508,7 @@ class Reconstruction:
         if result.grid is None:
             return
         grids = [result.grid, *(one.grid for one in result.further)]
-        for stamp, fit in self.bodies[0].carver.shadow_fits(grids).items():
+        for stamp, fit in self.bodies[0].shadow_fits(grids).items():
             if stamp in result.evidence:
                 told = replace(result.evidence[stamp], unexplained=fit.unexplained, lit=fit.lit)
                 result.evidence[stamp] = told

@@ -204,6 +204,42 @@ def test_each_fault_is_placed_and_has_a_remedy(tmp_path, spoil, topic, problem, 
     assert remedy in found[0].remedy
 
 
+def test_a_view_that_a_recorder_lost_half_of_is_no_error_where_nothing_needs_it(tmp_path):
+    """As ros2 bag record leaves it on a busy machine: it reads no reports."""
+    a, b, c = run_messages()
+    image, _ = view_to_msgs(FACTORY, view(10), "shadow")
+    run = [("/csas/image", a), ("/csas/camera_info", b), ("/csas/track", c)]
+    lost = [("/csas/shadow/image", image)]
+
+    whole, views = check_bag(write(tmp_path / "whole", *run, *lost)), check_bag(write(tmp_path / "v", *lost))
+
+    assert whole.ok
+    (told,) = [f for f in whole.findings if "has no camera_info of the same stamp" in f.problem]
+    assert (told.level, told.topic) == ("warning", "/csas/shadow/image")
+    assert "has no camera_info of the same stamp" in only_of(views, "/csas/shadow/image").problem
+
+
+def only_of(report, topic):
+    (finding,) = [f for f in report.findings if f.level == "error" and f.topic == topic]
+    return finding
+
+
+def test_topics_of_other_objects_and_of_the_other_method_are_of_the_contract(tmp_path):
+    a, b, c = run_messages()
+    image, info = view_to_msgs(FACTORY, view(10), "shadow")
+    more = [("/csas/other_method/voxel_grid/image", image), ("/csas/object_2/voxel_grid/camera_info", info)]
+    path = write(
+        tmp_path / "run",
+        *(("/csas/image", a), ("/csas/camera_info", b), ("/csas/track", c)),
+        *more,
+        ("/csas/own/image", image),
+    )
+
+    (told,) = [f for f in check_bag(path).findings if "not part of the contract" in f.problem]
+
+    assert told.problem == "1 topics are not part of the contract: /csas/own/image"
+
+
 def test_a_topic_of_another_type_is_named_with_the_right_one(tmp_path):
     a, b, _ = run_messages()
     wrong = FACTORY.make("geometry_msgs/msg/PoseStamped")

@@ -30,6 +30,9 @@ def prefix(tmp_path_factory: pytest.TempPathFactory) -> Path:
         script = made / "lib/csas_shadow_ros" / node
         script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m csas_shadow_ros.nodes.{node} "$@"\n')
         script.chmod(0o755)
+    line = made / "lib/csas_shadow_ros/csas-shadow"
+    line.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m csas_shadow_ros.cli "$@"\n')
+    line.chmod(0o755)
     return made
 
 

@@ -61,6 +61,23 @@ class FindPackageShare(Substitution):
         return str(get_package_share_directory(self.package))
 
 
+class ExecutableInPackage(Substitution):
+    def __init__(self, executable: str, package: str) -> None:
+        self.executable, self.package = executable, package
+
+    def perform(self, context: LaunchContext) -> str:
+        return executable_of(self.package, self.executable)
+
+
+def executable_of(package: str, executable: str) -> str:
+    from ament_index_python.packages import get_package_prefix
+
+    place = Path(get_package_prefix(package)) / "lib" / package / executable
+    if not os.access(place, os.X_OK):
+        raise RuntimeError(f"executable '{executable}' not found on the libexec directory '{place.parent}'")
+    return str(place)
+
+
 class Action:
     condition = None
 
@@ -136,12 +153,9 @@ class Node(ExecuteProcess):
         self.namespace, self.parameters = namespace, parameters
 
     def command(self, context: LaunchContext) -> list[str]:
-        from ament_index_python.packages import get_package_prefix
-
-        place = Path(get_package_prefix(self.package)) / "lib" / self.package / self.executable
-        assert os.access(place, os.X_OK), f"{place} cannot be executed"
         space = f"/{self.namespace.strip('/')}"
-        command = [str(place), "--ros-args", *(perform(word, context) for word in self.ros_arguments)]
+        command = [executable_of(self.package, self.executable), "--ros-args"]
+        command += [perform(word, context) for word in self.ros_arguments]
         command += ["-r", f"__node:={self.name}", "-r", f"__ns:={space}"]
         for one in self.parameters:
             command += ["--params-file", self._file(one) if isinstance(one, dict) else perform(one, context)]
@@ -174,4 +188,4 @@ def install() -> None:
     module("launch.substitutions", LaunchConfiguration, PathJoinSubstitution)
     module("launch_ros")
     module("launch_ros.actions", Node)
-    module("launch_ros.substitutions", FindPackageShare)
+    module("launch_ros.substitutions", ExecutableInPackage, FindPackageShare)

@@ -16,7 +16,7 @@ echo can cover; the others are seabed, and carve what the first look left standi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -421,6 +421,11 @@ class Carver:
         #: Stamps of the views that have been integrated.
         self.stamps: set[int] = set()
 
+    @property
+    def keeps_masks(self) -> bool:
+        """Whether the method keeps its silhouettes."""
+        return method_named(self.parameters.method).looks_twice
+
     def integrate(self, view: View) -> bool:
         """Integrate one view.
 
@@ -456,7 +461,7 @@ class Carver:
         else:
             self._sums.add_image(np.ascontiguousarray(view.pixels), view.info)
         self.stamps.add(view.info.stamp_ns)
-        if method_named(self.parameters.method).looks_twice:
+        if self.keeps_masks:
             self._masks[view.info.stamp_ns] = KeptMask.of(view)
         return True
 
@@ -659,21 +664,8 @@ class Carver:
         """
         asked = tuple(grids), len(self._masks)
         if self._fits is None or self._fits[0] != asked:  # bodies are equal only to themselves
-            self._fits = asked, self._compared(grids)
+            self._fits = asked, compared_shadows(self._masks, grids)
         return self._fits[1]
-
-    def _compared(self, grids: Sequence[VoxelGrid]) -> dict[int, ShadowFit]:
-        """Compare the silhouettes with bodies' shadows, whoever asked before."""
-        seabed = grids[0].seabed
-
-        def fit(kept: KeptMask) -> ShadowFit:
-            mask = kept.view()
-            if seabed is not None:
-                mask = replace(mask, info=seabed.corrected(mask.info))
-            return shadow_fit(mask, grids)
-
-        found = in_order(lambda item: fit(item[1]), self._masks.items(), _LOOKERS)
-        return {stamp: one for (stamp, _), one in found}
 
     def first_look(self) -> VoxelGrid:
         """Threshold the voxels carved so far, with covered pixels unknown: the start of `grid`."""
@@ -727,6 +719,20 @@ class Carver:
         likelihood[box] = _mean(sums.total, sums.count, self.parameters, len(self.stamps))
         views[box] = sums.count
         return thresholded(self.volume, likelihood, views, self.parameters)
+
+
+def compared_shadows(masks: Mapping[int, KeptMask], grids: Sequence[VoxelGrid]) -> dict[int, ShadowFit]:
+    """Compare silhouettes with the shadows of bodies, the silhouettes' own body first, by stamp."""
+    seabed = grids[0].seabed
+
+    def fit(kept: KeptMask) -> ShadowFit:
+        mask = kept.view()
+        if seabed is not None:
+            mask = replace(mask, info=seabed.corrected(mask.info))
+        return shadow_fit(mask, grids)
+
+    found = in_order(lambda item: fit(item[1]), masks.items(), _LOOKERS)
+    return {stamp: one for (stamp, _), one in found}
 
 
 class _Echoes:

@@ -732,10 +732,17 @@ class Latched:
             self._profile = profile
             self.subscription = self._subscribe(profile)
             for p in lossy:
-                who = f"{p.node_namespace.rstrip('/')}/{p.node_name}"
+                who = _publisher_name(p)
                 self._node.get_logger().warning(
                     f"{name}: {who} publishes best effort: lost messages are not resent"
                 )
+
+
+def _publisher_name(publisher: TopicEndpointInfo) -> str:
+    """Name a publisher; the middleware finds the endpoint before it knows whose it is."""
+    if publisher.node_name.startswith("_NODE_NAME_UNKNOWN"):
+        return "a publisher whose node is not known yet"
+    return f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
 
 
 class Strangers:
@@ -796,7 +803,7 @@ class Strangers:
     @staticmethod
     def _fault(topic: str, publisher: TopicEndpointInfo, subscriptions: list[Subscription]) -> str:
         """Say why a publisher cannot be heard; empty if it can."""
-        who = f"{topic}: {publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
+        who = f"{topic}: {_publisher_name(publisher)}"
         expected = _type_name(subscriptions[0].msg_type)
         if publisher.topic_type != expected:
             return f"{who} publishes {publisher.topic_type}; expected {expected}"
