@@ -176,6 +176,8 @@ class ViewSubscriber:
         self._wake = threading.Condition()
         self._waiting: OrderedDict[int, tuple[Any, Any]] = OrderedDict()
         self._known: OrderedDict[tuple[Any, ...], tuple[str, str]] = OrderedDict()
+        #: Lines at which the callback has failed.
+        self._raised: set[tuple[str, int | None]] = set()
         self._working_on: tuple[Any, ...] = ()
         self._closed = False
         self._on_finished = on_finished
@@ -337,8 +339,19 @@ class ViewSubscriber:
         except (InvalidHandle, ExternalShutdownException):
             raise
         except Exception as error:
-            self._host.node.get_logger().debug("".join(traceback.format_exception(error)))
+            self._tell_of_raise(error, view)
             return REJECTED, f"{type(error).__name__}: {error}"
+
+    def _tell_of_raise(self, error: Exception, view: View) -> None:
+        """Log where the callback failed, once for each line of it; other views may fail there too."""
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        place = last.filename, last.lineno
+        if place not in self._raised:
+            self._raised.add(place)
+            told = "".join(traceback.format_exception(error)).rstrip()
+            self._host.node.get_logger().error(
+                f"the callback failed at the view stamped {view.info.stamp_ns} ns:\n{told}"
+            )
 
     def _outdated(self, info: ViewInfo) -> bool:
         return self._target is not None and not looks_at(info, self._target.centre_m[:2])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
@@ -51,6 +51,8 @@ _STAGES_BEFORE = {stage: makers(stage) for stage in get_args(Stage)}
 BEAT_S = 0.5
 #: What is published already comes within a second, on a busy machine in some.
 _COLLECT_S = 60.0
+#: A node of the user's own that is started beside a replay is there within this on a busy machine.
+_UNHEARD_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -168,6 +170,41 @@ class ReplayResult:
         return self.result.views_used
 
 
+class _OwnStage:
+    """A node of the user's own that takes the place of one that a replay leaves out.
+
+    Parameters
+    ----------
+    name : str
+        The node that is left out.
+    most_s : float
+        The replay ends if nobody publishes what it gives for so long.
+    """
+
+    def __init__(self, name: str, most_s: float) -> None:
+        self._name, self._most_s = name, most_s
+        self._streams = _NODES[name].gives
+        self._since_s, self._told, self._asked_s = time.monotonic(), False, 0.0
+
+    def look(self, node: Any, domain_id: int, tell: Callable[[str], None]) -> None:
+        """Look for it once a second; say once that it is not there, and end the replay if it stays away."""
+        now = time.monotonic()
+        if now - self._asked_s < BEAT_S:
+            return
+        self._asked_s = now
+        if any(node.count_publishers(f"{stream}/image") for stream in self._streams):
+            self._since_s, self._told = now, False
+            return
+        what = f"{' or '.join(self._streams)} in ROS domain {domain_id}"
+        if now - self._since_s > self._most_s:
+            raise ReplayError(
+                f"nobody published {what} for {self._most_s:g} s; expected your node in place of {self._name}"
+            )
+        if now - self._since_s > _UNHEARD_S and not self._told:
+            self._told = True
+            tell(f"nobody publishes {what}: waiting for your node in place of {self._name}")
+
+
 class _Watcher:
     """Listens to a graph: progress first, and results once they are complete.
 
@@ -221,7 +258,24 @@ class _Watcher:
         #: Who else's graph is at work here; empty if nobody's is.
         self.rival = ""
         self._graph = graph
+        self._domain_id = domain_id
+        self._stages: list[_OwnStage] = []
         self._subscribe("progress", qos.REPORTS, self._on_progress, raw=True)
+
+    def awaits(self, left_out: Sequence[str], stall_timeout_s: float) -> None:
+        """Look out from now on for nodes of the user's own in place of those left out."""
+        self._stages = [_OwnStage(name, stall_timeout_s) for name in left_out]
+
+    def look_for_stages(self, tell: Callable[[str], None]) -> None:
+        """Say which of them is not there.
+
+        Raises
+        ------
+        ReplayError
+            If one has been missing for too long.
+        """
+        for stage in self._stages:
+            stage.look(self._node, self._domain_id, tell)
 
     def _subscribe(
         self, topic: str, profile: Any, callback: Callable[[Any], None], *, raw: bool = False
@@ -454,6 +508,7 @@ def replay(
         check(plan)
         graph, watcher = stack.enter_context(_running(plan, domain_id, out / "log", max_restarts))
         done = stack.enter_context(_shown(progress))
+        watcher.awaits([name for name in chain(chosen) if name in without], stall_timeout_s)
         _until_complete(graph, watcher, chosen, done, tell, stall_timeout_s)
         through = time.monotonic()
         messages = _collect(graph, watcher, chosen, done, tell, stall_timeout_s)
@@ -639,6 +694,7 @@ def _until_complete(
         told = len(graph.deaths)
         for name, text in watcher.errors.items():
             raise _error_of(name, text)
+        watcher.look_for_stages(tell)
         beat = watcher.beats.get((sender, source))
         if beat is not None and beat.counts.get("total"):
             progress(beat.counts["done"], beat.counts["total"])

@@ -448,13 +448,13 @@ def figure_7(subject: Subject) -> Figure:
     colours = {
         "outside": (0.85, 0.85, 0.85),
         "knows nothing": (0.55, 0.65, 0.85),
-        "covered, or open below": (0.9, 0.75, 0.45),
+        "covered by the target": (0.9, 0.75, 0.45),
         "shadow": (0.0, 0.0, 0.0),
     }
     picture = np.empty((*mask.pixels.shape, 3))
     picture[:] = colours["outside"]
     picture[mask.pixels == MASK_UNKNOWN] = colours["knows nothing"]
-    picture[mask.pixels == MASK_COVERED] = colours["covered, or open below"]
+    picture[mask.pixels == MASK_COVERED] = colours["covered by the target"]
     picture[mask.pixels == MASK_SHADOW] = colours["shadow"]
     _show_view(b, subject, mask, picture, "(b) segmented automatically")
     handles = [Patch(facecolor=c, edgecolor="0.3", label=n) for n, c in colours.items()]

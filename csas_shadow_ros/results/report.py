@@ -608,7 +608,7 @@ def summary(report: Mapping[str, Any]) -> str:
         *([*_size_lines(mine, true), ""] if mine or true else []),
         *_place_lines(report),
         *_score_lines(truth),
-        *(f"{quality['verdict']}: {reason}" for reason in quality["reasons"]),
+        *(f"because {reason}" for reason in quality["reasons"]),
         *_carving_lines(report),
         *_object_lines(report),
         *_view_lines(report["views"]),

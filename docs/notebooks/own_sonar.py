@@ -34,7 +34,7 @@ across_m = 2 * np.pi / centre / np.radians(12.0)
 print(f"resolution in range {2 * np.pi / (high - low):.3f} m, across {across_m:.3f} m in a view of 12°")
 
 # %% [markdown]
-# A band that does not fit the pixels is refused, with the pixel that it needs:
+# A band that does not fit the pixels is refused, with what fits them:
 
 # %%
 try:
@@ -65,7 +65,7 @@ print(worse)
 # %% [markdown]
 # ## Too large for the image
 #
-# The image must hold the target and its whole shadow. A cylinder 1.8 m long on an image of 2.56 m does not fit, and the search finds nothing:
+# The image must hold the target and its whole shadow. A cylinder 1.8 m long on an image of 2.56 m does not fit. The result is undecided: it names the place, and says that the shadow leaves the image:
 
 # %%
 large = csas.simulate(sonar, "cylinder", seed=1, progress=False)

@@ -16,6 +16,7 @@ from csas_shadow_ros.core.search.decision import Decision
 from csas_shadow_ros.core.shape.carving import Carver
 from csas_shadow_ros.core.shape.verdict import cut_sides
 from csas_shadow_ros.core.shape.volume import Target
+from csas_shadow_ros.simulation import simulate
 
 COARSE = PipelineParameters(
     sub_aperture=SubApertureParameters(step_deg=10.0), carving=CarvingParameters(voxel_size_m=0.03)
@@ -165,3 +166,33 @@ def test_without_a_usable_view_the_answer_is_undecided(whole):
     assert found.verdict == "undecided"
     assert "too dark" in found.quality.reasons[0]
     assert Reconstruction(Decision(None), COARSE).result().verdict == "no object"
+
+
+@pytest.mark.parametrize("method", ["soft", "hard"])
+def test_a_result_is_compared_with_the_shadows_whatever_carved_it(whole, method):
+    result, views = whole
+    p = replace(COARSE, carving=replace(COARSE.carving, method=method))
+    again = Reconstruction(replace(result.decision, others=()), p, run_ns=result.run_ns)
+    for view in views:
+        again.add(view)
+
+    evidence = again.result().evidence.values()
+
+    assert len(evidence) == len(views)
+    assert np.isfinite([[one.unexplained, one.lit] for one in evidence]).all()
+
+
+def test_a_shape_that_is_higher_than_every_shadow_allows_is_not_trustworthy():
+    """Most shadows leave the image, and soft carving fills what nobody saw: 0.6 m for a box of 0.4 m."""
+    made = simulate("tiny", "box", heading_deg=0.0)
+    p = replace(COARSE, carving=replace(COARSE.carving, method="soft", voxel_size_m=0.02))
+
+    soft = pipeline.run(made.image, made.track, p)
+    consensus = pipeline.run(made.image, made.track, replace(p, carving=CarvingParameters(voxel_size_m=0.02)))
+
+    assert soft.dimensions.intervals["height_m"][0] > 0.4
+    assert soft.quality.verdict == "not trustworthy"
+    assert any("no shadow reaches as far as the height says" in reason for reason in soft.quality.reasons)
+    low, high = consensus.dimensions.intervals["height_m"]
+    assert low < 0.4 < high
+    assert consensus.quality.verdict == "limited"

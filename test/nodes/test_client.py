@@ -27,7 +27,13 @@ from rclpy.executors import SingleThreadedExecutor
 from csas_shadow_ros import client, parameters
 from csas_shadow_ros.client import ViewSubscriber
 from csas_shadow_ros.core.errors import ParameterError
-from csas_shadow_ros.graph.processes import DomainReservation, Graph, graph_environment, start_fork_server
+from csas_shadow_ros.graph.processes import (
+    DomainReservation,
+    Graph,
+    ReplayError,
+    graph_environment,
+    start_fork_server,
+)
 from csas_shadow_ros.graph.replay import replay
 from csas_shadow_ros.nodes import qos
 from csas_shadow_ros.nodes.runtime import hearing
@@ -359,6 +365,27 @@ def test_a_replay_without_a_stage_carves_what_ones_own_makes_in_its_place(
     assert made.dimensions is not None
 
 
+@pytest.mark.timeout(120)
+def test_a_replay_that_lacks_ones_own_stage_says_so_and_ends(run_bag: Path, tmp_path: Path) -> None:
+    told: list[str] = []
+
+    expected = r"nobody published likelihood or shadow_mask in ROS domain \d+ for 8 s"
+    with pytest.raises(ReplayError, match=expected):
+        replay(
+            run_bag,
+            tmp_path / "out",
+            parameters(step_deg=15, voxel_size_m=VOXEL_M),
+            without=["shadow_likelihood"],
+            record=False,
+            progress=False,
+            notice=told.append,
+            stall_timeout_s=8.0,
+        )
+
+    assert len(told) == 1
+    assert "waiting for your node in place of shadow_likelihood" in told[0]
+
+
 def test_views_that_an_outside_stage_refuses_or_fails_at_are_named_and_nobody_waits_for_them(
     live: Callable[..., Live], tmp_path: Path
 ) -> None:
@@ -371,6 +398,9 @@ def test_views_that_an_outside_stage_refuses_or_fails_at_are_named_and_nobody_wa
     refused = [told.count(f"rejected: {reason}") for reason in reasons]
     assert min(refused) > 0, told
     graph.until(lambda: graph.carved() == VIEWS - sum(refused), "the carver has all others, and ends")
+    log = (graph.folder / "outside_0.log").read_text()
+    assert log.count("the callback failed at the view stamped") == 1, "once for the line that fails"
+    assert "Traceback" in log
 
 
 def test_what_cannot_be_subscribed_to_is_refused() -> None:

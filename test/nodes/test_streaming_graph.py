@@ -150,7 +150,7 @@ def test_the_last_sectors_views_are_through_before_the_whole_circle_is_searched(
 def test_the_target_of_an_open_circle_moves_when_it_is_closed_and_all_is_carved_again(
     graph: Graph, sector_bag: Path, reference_of_sectors: Result
 ) -> None:
-    nodes = streaming_graph(graph, sector_bag, 60.0)
+    nodes = streaming_graph(graph, sector_bag, 30.0)
     graph.spin_until(lambda: nodes["carver"].state_counts()["views"] >= 8)
     assert nodes["sub_aperture"].state_counts()["arc_deg"] < 360
     first = nodes["carver"].target.target

@@ -34,6 +34,8 @@ _SCATTER_CELLS = 1.0
 #: that see a tip. Those alone bound the top, so that a quarter of the circle without tips changes no height
 #: (the benchmark's frame, 28 %); with none the top is unknown.
 _MOST_CUT = 0.5
+#: So many views (looks) whose shadow ends in the image contradict a height: one may be a bad silhouette.
+_LEAST_ENDS = 3
 #: So many sides `cut_sides` looks at: the bottom is the seabed.
 _ALL_SIDES = 5
 
@@ -206,7 +208,26 @@ def _fit_of(result: Result, reasons: list[str]) -> int:
             " one another, or there are several bodies"
         )
         worst = max(worst, 1)
+    if text := _too_high(result):
+        reasons.append(text)
+        worst = 2
     return worst
+
+
+def _too_high(result: Result) -> str:
+    """Say that every shadow's end contradicts the height: the top of a body casts each end."""
+    if result.dimensions is None or "height_m" not in result.dimensions.intervals:
+        return ""
+    ends = [
+        result.evidence[side.info.stamp_ns].height_m
+        for side in result.sides
+        if not side.cut and side.info.stamp_ns in result.evidence
+    ]
+    ends = [height for height in ends if math.isfinite(height)]
+    least = result.dimensions.intervals["height_m"][0]
+    if len(ends) < _LEAST_ENDS or max(ends) >= least:
+        return ""
+    return f"no shadow reaches as far as the height says: {max(ends):.2f} m at most, expected {least:.2f} m"
 
 
 def explained_share(result: Result) -> float | None:
