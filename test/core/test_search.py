@@ -21,6 +21,7 @@ from csas_shadow_ros.core.shape.volume import Target
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.profiles import Faults
 from csas_shadow_ros.simulation.seabed import Bump, Patch, Seabed
+from csas_shadow_ros.simulation.targets import box
 
 COARSE = PipelineParameters(sub_aperture=SubApertureParameters(step_deg=6.0))
 PLACE = (0.1, -0.1)
@@ -144,3 +145,17 @@ def test_a_given_volume_that_holds_nothing_is_no_object():
     result = Result(target=Target((0.5, 0.0), (1.0, 1.0, 0.5), evidence=0.1), views_used=10)
     judge(result)
     assert result.verdict == "undecided"
+
+
+@pytest.mark.parametrize("contrast_db", [4.0, 6.0])
+def test_a_faint_body_under_a_wrong_sign_is_no_empty_seabed(contrast_db):
+    """What is faint proves no sign wrong. If it is found there alone, "no object" is not good."""
+    faults = Faults(contrast_db=contrast_db)
+    made = simulate("tiny", box(0.3, 0.2, 0.2), seed=3, position_m=(0.1, -0.15), faults=faults)
+    wrong = replace(made.image.acoustics, spectrum_sign=-made.image.acoustics.spectrum_sign)
+
+    result = run(replace(made.image, acoustics=wrong), made.track, COARSE)
+
+    assert (result.verdict, result.quality.verdict) == ("no object", "limited")
+    (reason,) = result.quality.reasons
+    assert reason.startswith("nothing tells the spectrum_sign: under the other")

@@ -651,7 +651,12 @@ def spectrum_sign_evidence(
     ]
     against = max(contrary, default=0.0)
     if other.twice:
-        against = min(against, best)  # what is faint raises doubts, and proves no sign wrong
+        # What is faint proves no sign wrong. It raises a doubt where nothing else would be said of the scene.
+        if against > _SIGN_RATIO * best and not stated.left_out:
+            faint = next(target for target in other.targets if target.evidence == against)
+            doubt = LeftOut(faint.position_m, f"{OTHER_SIGN} a faint body throws a shadow here")
+            stated = replace(stated, left_out=(*stated.left_out, doubt))
+        against = min(against, best)
     evidence = SignEvidence(sign, best, against)
     evident = other.best is not None and not other.twice and other.best.evidence > _SIGN_RATIO * best
     if other.best is not None and evident and not contrary:
