@@ -82,12 +82,12 @@ def reconstruct(
     --------
     >>> import csas_shadow_ros as csas
     >>> run = csas.read_run("box_run")
-    >>> result = csas.reconstruct(run, csas.parameters(step_deg=15))
+    >>> result = csas.reconstruct(run, csas.parameters(step_deg=5))
     >>> result
     Result: object, quality limited
-      the shadow leaves the image in ... of 24 views, expected a larger image
+      the shadow leaves the image in ... of 72 views, expected a larger image
       0... × 0... × 0... m, 0... m³, heading ...°, at x ..., y ... m
-      24 views used, 0 refused, 288° of the circle
+      72 views used, 0 refused, 360° of the circle
     >>> result.mesh.is_watertight
     True
     """
