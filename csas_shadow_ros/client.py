@@ -301,7 +301,7 @@ class ViewSubscriber:
         key = (stamp, *info.p, *info.d)
         known = self._known.get(key)
         if known is None or self._outlet is not None:
-            known = self._ask(image, info)
+            known = self._ask(stamp, image, info)
         else:
             self._host.counts["duplicates"] += 1
         if known is None:
@@ -317,7 +317,7 @@ class ViewSubscriber:
         else:
             self._inlet.report(stamp, outcome)
 
-    def _ask(self, image: Any, info: Any) -> tuple[str, str] | None:
+    def _ask(self, stamp: int, image: Any, info: Any) -> tuple[str, str] | None:
         """Call back; return (outcome, reason), None for a view of a target that has moved since."""
         try:
             view = view_from_msgs(image, info, self._stream)
@@ -339,10 +339,10 @@ class ViewSubscriber:
         except (InvalidHandle, ExternalShutdownException):
             raise
         except Exception as error:
-            self._tell_of_raise(error, view)
+            self._tell_of_raise(error, stamp)
             return REJECTED, f"{type(error).__name__}: {error}"
 
-    def _tell_of_raise(self, error: Exception, view: View) -> None:
+    def _tell_of_raise(self, error: Exception, stamp: int) -> None:
         """Log where the callback failed, once for each line of it; other views may fail there too."""
         last = traceback.extract_tb(error.__traceback__)[-1]
         place = last.filename, last.lineno
@@ -350,7 +350,7 @@ class ViewSubscriber:
             self._raised.add(place)
             told = "".join(traceback.format_exception(error)).rstrip()
             self._host.node.get_logger().error(
-                f"the callback failed at the view stamped {view.info.stamp_ns} ns:\n{told}"
+                f"the callback failed at the view stamped {stamp} ns:\n{told}"
             )
 
     def _outdated(self, info: ViewInfo) -> bool:

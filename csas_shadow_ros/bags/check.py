@@ -40,6 +40,9 @@ from .run import Run, read_run
 from .tracks import BagRuns
 
 ERROR, WARNING, INFO = "error", "warning", "info"
+#: What a run is made from, with a track, and the topics of it.
+_IMAGES = ("image", "sector")
+_INPUTS = frozenset(t for name in _IMAGES for t in (STREAMS[name].image_topic, STREAMS[name].info_topic))
 
 #: Band edges are widened by this much before energy is counted inside them.
 BAND_MARGIN = 0.1
@@ -231,7 +234,7 @@ class _Check:
         elif "of the same stamp" in problem.reason and "has no" in problem.reason:
             remedy = "Give an image and its camera_info the very same header.stamp, and record both topics."
             # ros2 bag record loses views: nothing needs them where the run can be made from its start.
-            if self.can_start() and not relative.startswith(("image", "camera_info", "sector/")):
+            if self.start_images() and "track" in self.report.usable and relative not in _INPUTS:
                 level = WARNING
         elif "differs from an earlier" in problem.reason:
             remedy = "The stamp identifies a view: give every view a stamp of its own."
@@ -241,10 +244,9 @@ class _Check:
             level, problem.topic, problem.reason, remedy, number=problem.number, stamp_ns=problem.stamp_ns
         )
 
-    def can_start(self) -> bool:
-        """Say whether a run can be made from image or sectors, as far as the bag was read."""
-        usable = self.report.usable
-        return "track" in usable and any(usable.get(s) for s in ("image", "sector"))
+    def start_images(self) -> list[str]:
+        """Name the streams that a run can be made from with a track, as far as the bag was read."""
+        return [name for name in _IMAGES if self.report.usable.get(name)]
 
     def name(self, relative: str) -> str:
         return absolute_name(relative, self.reader.namespace)
@@ -329,7 +331,7 @@ class _Check:
             return True
         if self.runs.is_of_another(stamp_ns):
             return False
-        if stream_name in ("image", "sector"):
+        if stream_name in _IMAGES:
             # A run goes on without a sector, but not without its image.
             level = ERROR if stream_name == "image" else WARNING
             self.say(level, topic, self.runs.not_covered(), _ONE_CLOCK, number=number, stamp_ns=stamp_ns)
@@ -399,7 +401,7 @@ class _Check:
 
     def check_start(self) -> None:
         usable = self.report.usable
-        images = [s for s in ("image", "sector") if usable.get(s)]
+        images = self.start_images()
         views = [s for s in VIEW_STREAMS if usable.get(s)]
         if images and "track" in usable:
             self.say(INFO, "", f"processing can start from {images[0]} and track")

@@ -33,7 +33,6 @@ def equal_where_nan(cls: C) -> C:
 
     Examples
     --------
-    >>> import pickle
     >>> from dataclasses import dataclass
     >>> @equal_where_nan
     ... @dataclass(frozen=True)

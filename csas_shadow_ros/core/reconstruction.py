@@ -72,6 +72,8 @@ class Body:
         Of all stages.
     compare : bool
         Carve by the other method too (figure 8).
+    judged : bool
+        Keep the silhouettes by which the result is judged, also where the carver keeps none.
     """
 
     def __init__(
@@ -80,6 +82,7 @@ class Body:
         parameters: PipelineParameters,
         *,
         compare: bool = False,
+        judged: bool = False,
         pool: ThreadPoolExecutor | None = None,
     ) -> None:
         p = parameters.carving
@@ -96,6 +99,7 @@ class Body:
         #: Nothing can be left of it any more: it takes no further views.
         self.given_up = False
         self._masks: dict[int, KeptMask] = {}
+        self._shows = judged and not self.carver.keeps_masks
         #: Silhouettes by which the result is judged, where the carver keeps none.
         self._shown: dict[int, KeptMask] = {}
         self._waiting: OrderedDict[int, Levels] = OrderedDict()
@@ -122,8 +126,8 @@ class Body:
                 self.looks[stamp] = view.look
         if mask is not None or levels is not None:
             self._take_sides(stamp, view, mask, levels)
-        if mask is not None and not self.carver.keeps_masks:
-            self._shown.setdefault(stamp, KeptMask.of(mask))
+        if self._shows and mask is not None and stamp not in self._shown:
+            self._shown[stamp] = KeptMask.of(mask)
         fresh, errors = False, []
         for carver in (self.carver, self.other):
             pixels = None if carver is None else mask if carver.parameters.takes_masks else likelihood
@@ -254,7 +258,7 @@ class Reconstruction:
         self.decision, self.run_ns = decision, run_ns
         self.bodies: list[Body] = []
         if decision.target is not None:
-            self.bodies = [Body(decision.target, p, compare=compare, pool=pool)]
+            self.bodies = [Body(decision.target, p, compare=compare, judged=True, pool=pool)]
             self.bodies += [Body(other, p, pool=pool) for other in decision.others]
         self.arcs = Arcs()
         self.rejected: dict[float, str] = {}

@@ -187,7 +187,7 @@ class _OwnStage:
         self._since_s, self._told, self._asked_s = time.monotonic(), False, 0.0
 
     def look(self, node: Any, domain_id: int, tell: Callable[[str], None]) -> None:
-        """Look for it once a second; say once that it is not there, and end the replay if it stays away."""
+        """Look for it at every beat; say once that it is not there, and end the replay if it stays away."""
         now = time.monotonic()
         if now - self._asked_s < BEAT_S:
             return
@@ -694,7 +694,8 @@ def _until_complete(
         told = len(graph.deaths)
         for name, text in watcher.errors.items():
             raise _error_of(name, text)
-        watcher.look_for_stages(tell)
+        if not finished:  # then it has nothing left to do, and may have ended
+            watcher.look_for_stages(tell)
         beat = watcher.beats.get((sender, source))
         if beat is not None and beat.counts.get("total"):
             progress(beat.counts["done"], beat.counts["total"])

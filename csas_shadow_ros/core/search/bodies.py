@@ -645,15 +645,15 @@ def spectrum_sign_evidence(
         doubts = (replace(left, reason=f"{OTHER_SIGN} {left.reason}") for left in leaving)
         stated = replace(stated, left_out=(*stated.left_out, *doubts))
     contrary = [
-        target.evidence
+        target
         for target, thrown in zip(other.targets, other.thrown, strict=True)
         if not thrown.front >= _PLAIN
     ]
-    against = max(contrary, default=0.0)
+    against = max((target.evidence for target in contrary), default=0.0)
     if other.twice:
-        # What is faint proves no sign wrong. It raises a doubt where nothing else would be said of the scene.
+        # What is faint proves no sign wrong. It raises a doubt where the search names nothing else.
         if against > _SIGN_RATIO * best and not stated.left_out:
-            faint = next(target for target in other.targets if target.evidence == against)
+            faint = max(contrary, key=lambda target: target.evidence)
             doubt = LeftOut(faint.position_m, f"{OTHER_SIGN} a faint body throws a shadow here")
             stated = replace(stated, left_out=(*stated.left_out, doubt))
         against = min(against, best)
