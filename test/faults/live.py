@@ -76,6 +76,8 @@ class Vehicle:
         #: Hash of the grid, and views used, of each run that was published as final.
         self.final: dict[int | None, tuple[str, int]] = {}
         self.lost: dict[str, int] = {}
+        #: Nodes that have spoken.
+        self.heard: set[str] = set()
         self._sent: dict[str, Any] = {}
         self._begin()
 
@@ -103,6 +105,7 @@ class Vehicle:
 
     def _hear(self, msg: Any) -> None:
         item = progress_from_msg(msg)
+        self.heard.add(item.node)
         if isinstance(item, Heartbeat) and item.counts.get("lost"):
             self.lost[item.instance] = item.counts["lost"]
 
@@ -218,6 +221,12 @@ class Voyage:
         stack.enter_context(self.graph)
         self.vehicle = Vehicle(self.graph, domain, given.namespace)
         stack.callback(self.vehicle.close)
+        # A circle takes 2 s here: the first would be over before a recorder that starts slowly is there.
+        end = time.monotonic() + PATIENCE_S
+        while not self.vehicle.heard >= PLAN.keys():
+            self._look()
+            if time.monotonic() > end:
+                raise TimeoutError(f"never heard: {', '.join(sorted(PLAN.keys() - self.vehicle.heard))}")
 
     def _look(self) -> None:
         """Start again what died, and take what came."""
