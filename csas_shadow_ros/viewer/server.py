@@ -58,6 +58,16 @@ def is_loopback(host: str) -> bool:
         return False
 
 
+async def _settle() -> None:
+    """Let what the loop has begun with a socket end.
+
+    asyncio takes three turns from a connection that it accepts to a protocol that knows its transport,
+    and one from a transport that is closed to its socket.
+    """
+    for _ in range(4):
+        await asyncio.sleep(0)
+
+
 class ViewerServer:
     """Serves a store to browsers, in a thread with an event loop of its own.
 
@@ -135,19 +145,22 @@ class ViewerServer:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         runner = web.AppRunner(self._app(), access_log=None, shutdown_timeout=0.5)
         await runner.setup()
+        family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
         try:
-            family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
             listening = socket.create_server((self.host, self.port), family=family)
-            await web.SockSite(runner, listening).start()
-            self.port = listening.getsockname()[1]
-            self._ready.set()
-            await self._stop.wait()
-            for queue in self._queues:
-                with contextlib.suppress(asyncio.QueueFull):
-                    queue.put_nowait(None)
+            try:
+                await web.SockSite(runner, listening).start()
+                self.port = listening.getsockname()[1]
+                self._ready.set()
+                await self._stop.wait()
+                for queue in self._queues:
+                    with contextlib.suppress(asyncio.QueueFull):
+                        queue.put_nowait(None)
+            finally:
+                # A server that closes loses the sockets that it has accepted and not yet attached.
+                self._loop.remove_reader(listening)
+                await _settle()
         finally:
-            for each in list(runner.sites):
-                await each.stop()
             served = runner.server
             assert served is not None  # set up above
             open_yet = [c.transport for c in served.connections if c.transport is not None]
@@ -155,9 +168,7 @@ class ViewerServer:
             # A page that has stopped reading would keep what it was sent, and the socket, for ever.
             for transport in open_yet:
                 transport.abort()
-            # A socket closes a turn of the loop after its transport; one that was just accepted, two later.
-            for _ in range(4):
-                await asyncio.sleep(0)
+            await _settle()
 
     def _app(self) -> web.Application:
         app = web.Application(middlewares=[self._guard], client_max_size=_MOST_POSTED)
