@@ -497,9 +497,11 @@ def judge_image(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, 
         )
         return
     yield from judge_geometry(image.grid, track)
-    yield from judge_band(image.grid, image.acoustics, track)
+    folded = [*judge_band(image.grid, image.acoustics, track)]
+    yield from folded
     yield from judge_stuck(image)
-    yield from judge_energy(image, track)
+    if not folded:  # or its energy lies where it was folded to
+        yield from judge_energy(image, track)
 
 
 def judge_sectors(run: Run, track: Track) -> Iterator[tuple[str, str, str]]:
@@ -597,24 +599,13 @@ def judge_geometry(grid: GroundGrid, track: Track) -> Iterator[tuple[str, str, s
 
 
 def judge_band(grid: GroundGrid, acoustics: Acoustics, track: Track) -> Iterator[tuple[str, str, str]]:
-    """Yield (level, problem, remedy) if the stated band does not fit the pixel spacing."""
-    low, _, high = acoustics.ground_band(track.grazing_rad)
-    nyquist = math.pi / grid.spacing_m
-    if high > nyquist * (1 + BAND_MARGIN):
+    """Yield (level, problem, remedy) if the pixels cannot hold the stated band."""
+    if too_coarse := acoustics.folds(grid.spacing_m, track.grazing_rad):
         yield (
             ERROR,
-            f"the stated band reaches K = {high:.1f} rad/m, but pixels of {grid.spacing_m:g} m hold only"
-            f" {nyquist:.1f}",
-            "The image is too coarse for its band, or a frequency, the sound speed or the pixel spacing in"
-            f" camera_info is wrong (band K {low:.1f} to {high:.1f} rad/m at"
-            f" {math.degrees(track.grazing_rad):.1f} degrees grazing).",
-        )
-    elif high > nyquist:
-        yield (
-            WARNING,
-            f"the stated band's edge, K = {high:.1f} rad/m, is just beyond what pixels of"
-            f" {grid.spacing_m:g} m hold ({nyquist:.1f})",
-            "Image on slightly finer pixels, or the edge of the spectrum folds over.",
+            too_coarse,
+            "Form the image on finer pixels, or correct the frequencies, the sound speed (camera_info.d) or"
+            f" the pixel spacing (p). The track's grazing angle is {math.degrees(track.grazing_rad):.1f}°.",
         )
 
 
@@ -798,6 +789,8 @@ def judge_view(view: View, track: Track) -> Iterator[tuple[str, str, str]]:
 
 def check_spectrum_sign(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, str]]:
     """Yield (level, problem, remedy) if the image contradicts its stated spectrum sign."""
+    if image.acoustics.folds(image.grid.spacing_m, track.grazing_rad):
+        return  # said already
     # Imported here: a bag of views is checked without the weight of the whole method.
     from csas_shadow_ros.core.search.bodies import LEAVES, spectrum_sign_evidence
 

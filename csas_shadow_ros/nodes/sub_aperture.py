@@ -14,7 +14,7 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from csas_shadow_ros.bags.check import ERROR, judge_band, judge_coverage, judge_geometry, judge_image
+from csas_shadow_ros.bags.check import ERROR, judge_coverage, judge_geometry, judge_image
 from csas_shadow_ros.core.errors import CsasError, TrackError, ViewError
 from csas_shadow_ros.core.geometry import CoherentImage, Track
 from csas_shadow_ros.core.imaging.subaperture import SubApertures
@@ -448,8 +448,8 @@ class SubApertureNode(CsasNode):
         elif run.image_stamp is None and stream.ended:
             found = [*judge_image(stream.sum.image(), stream.track)]
         elif run.image_stamp is None:
+            # Its lattice holds the band: a sector that folds it is refused by itself.
             found = [*judge_geometry(frame.grid, stream.track)]
-            found += judge_band(frame.grid, frame.acoustics, stream.track)
         for level, problem, remedy in found:
             if level == ERROR:
                 raise ViewError(f"{problem}. {remedy}")

@@ -18,9 +18,10 @@ from csas_shadow_ros.bags.check import (
     judge_band,
     judge_energy,
     judge_geometry,
+    judge_image,
     judge_stuck,
 )
-from csas_shadow_ros.core.errors import BagError, ViewError
+from csas_shadow_ros.core.errors import BagError, ParameterError, ViewError
 from csas_shadow_ros.core.geometry import (
     Acoustics,
     CoherentImage,
@@ -31,6 +32,8 @@ from csas_shadow_ros.core.geometry import (
     ViewInfo,
     view_ground_to_pixel,
 )
+from csas_shadow_ros.core.imaging.subaperture import SubApertures
+from csas_shadow_ros.core.parameters import SubApertureParameters
 from csas_shadow_ros.core.search.bodies import SignEvidence
 from csas_shadow_ros.run_bag import refuse_contradictions
 from msg_adapters import RosbagsMessages, coherent_image_to_msgs, track_to_msg, view_to_msgs
@@ -343,27 +346,32 @@ def test_the_remedy_names_the_frequencies_where_the_energy_is():
     assert 132e3 < high < 142e3
 
 
-def test_a_band_beyond_the_pixels_is_an_error_and_just_beyond_a_warning():
-    high = ACOUSTICS.ground_band(circle().grazing_rad)[2]
-
-    def at(factor):
-        grid = GroundGrid.centred(64, 64, math.pi / high * factor)
-        return levels(judge_band(grid, ACOUSTICS, circle()))
-
-    assert at(0.999) == []
-    assert at(1.05) == ["warning"]
-    assert at(1.2) == ["error"]
-
-
 @settings(max_examples=50)
 @given(factor=st.floats(0.2, 5.0), height=st.floats(1, 100))
-def test_the_band_fits_exactly_up_to_nyquist(factor, height):
+def test_a_band_that_the_pixels_cannot_hold_is_an_error(factor, height):
     track = circle(height=height)
     high = ACOUSTICS.ground_band(track.grazing_rad)[2]
     grid = GroundGrid.centred(64, 64, math.pi / high * factor)
-    expected = [] if factor <= 1 else ["warning"] if factor <= 1.1 else ["error"]
-    if min(abs(factor - 1), abs(factor - 1.1)) > 1e-9:
-        assert levels(judge_band(grid, ACOUSTICS, track)) == expected
+    if abs(factor - 1) > 1e-8:
+        assert levels(judge_band(grid, ACOUSTICS, track)) == ([] if factor < 1 else ["error"])
+
+
+@pytest.mark.parametrize("finer", [1.03, 0.97, 0.5])
+def test_check_calls_too_coarse_what_the_method_refuses_and_nothing_else(finer):
+    """A band 3 % beyond the pixels was a warning here, and an error of the method."""
+    image, track = annulus_image(), circle()
+    high = image.acoustics.ground_band(track.grazing_rad)[2]
+    coarse = replace(image, grid=replace(image.grid, spacing_m=math.pi / high / finer))
+    found = [problem for level, problem, _ in judge_image(coarse, track) if level == "error"]
+    if finer > 1.0:
+        SubApertures(coarse, track, SubApertureParameters())
+        assert not any("pixel of at most" in problem for problem in found)
+        return
+    with pytest.raises(ParameterError) as refused:
+        SubApertures(coarse, track, SubApertureParameters())
+    assert found == [str(refused.value)]
+    assert "expected a pixel of at most" in found[0]
+    assert [*check_spectrum_sign(coarse, track)] == []
 
 
 def test_a_track_over_the_image_or_beside_it_is_an_error():

@@ -270,7 +270,7 @@ def test_a_view_in_a_gap_of_the_track_is_refused_with_aspect_and_coverage():
 def test_a_band_that_the_pixels_fold_is_refused():
     grid = GroundGrid.centred(64, 64, 0.006)
     image = CoherentImage(np.zeros((64, 64), np.complex64), grid, acoustics())
-    with pytest.raises(ParameterError, match=r"band reaches 560 rad/m .* pixel of 6 mm holds only 524 rad/m"):
+    with pytest.raises(ParameterError, match=r"band reaches K = 560 rad/m .* 6 mm holds only 524 rad/m"):
         SubApertures(image, circle_track())
     wide = Acoustics(60e3, 60e3, 1500.0, 1)
     with pytest.raises(ParameterError, match="expected a pixel of at most"):

@@ -108,6 +108,19 @@ class Acoustics:
         low, mid, high = (self.ground_wavenumber(f, grazing_rad) for f in (f_c - half, f_c, f_c + half))
         return low, mid, high
 
+    def folds(self, spacing_m: float, grazing_rad: float) -> str:
+        """Say that pixels are too coarse for the band, whose edge would fold over; empty if they hold it.
+
+        Pixels hold wavenumbers up to π/d. Those below it by rounding alone are held.
+        """
+        high, nyquist = self.ground_band(grazing_rad)[2], math.pi / spacing_m
+        if high <= nyquist * (1.0 + 1e-9):
+            return ""
+        return (
+            f"the band reaches K = {high:.0f} rad/m on the ground, but a pixel of {spacing_m * 1e3:.3g} mm"
+            f" holds only {nyquist:.0f} rad/m: expected a pixel of at most {math.pi / high * 1e3:.3g} mm"
+        )
+
 
 @dataclass(frozen=True)
 class GroundGrid:

@@ -108,15 +108,10 @@ def band_of_image(image: CoherentImage, grazing_rad: float) -> tuple[float, floa
         If the band's upper edge does not fit the pixel spacing: the spectrum would be folded.
     """
     low, _, high = image.acoustics.ground_band(grazing_rad)
-    nyquist = math.pi / image.grid.spacing_m
-    if high > nyquist * (1 + 1e-9):
-        raise ParameterError(
-            f"the band reaches {high:.0f} rad/m on the ground, but a pixel of"
-            f" {image.grid.spacing_m * 1e3:.3g} mm holds only {nyquist:.0f} rad/m: expected a pixel of"
-            f" at most {math.pi / high * 1e3:.3g} mm"
-        )
+    if too_coarse := image.acoustics.folds(image.grid.spacing_m, grazing_rad):
+        raise ParameterError(too_coarse)
     margin = _BAND_MARGIN * (high - low)
-    return max(low - margin, 1e-6), min(high + margin, nyquist)
+    return max(low - margin, 1e-6), min(high + margin, math.pi / image.grid.spacing_m)
 
 
 def taper_table(name: str, entries: int = 1025) -> NDArray[np.float32]:
