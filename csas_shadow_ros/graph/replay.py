@@ -31,6 +31,7 @@ from .processes import (
     signals_deferred,
     start_fork_server,
 )
+from .refusals import Refusals, RejectedView
 
 # What takes long to import is imported where it is used: the nodes' processes are on their way by then.
 if TYPE_CHECKING:
@@ -72,28 +73,6 @@ class NodeReport:
     busy_s: float
     restarts: int
     counts: dict[str, int]
-
-
-@dataclass(frozen=True)
-class RejectedView:
-    """A view that was not used.
-
-    Parameters
-    ----------
-    node : str
-        Who refused it.
-    stamp_ns : int
-        Its stamp.
-    aspect_deg : float
-        Its aspect; NaN if it was not legible.
-    reason : str
-        Why.
-    """
-
-    node: str
-    stamp_ns: int
-    aspect_deg: float
-    reason: str
 
 
 @dataclass(eq=False)
@@ -250,7 +229,7 @@ class _Watcher:
         self._context = self._node.context
         self.beats: dict[tuple[str, str], Any] = {}
         self._dead: set[str] = set()
-        self.rejected: dict[tuple[int, str], RejectedView] = {}
+        self.refusals = Refusals()
         self.errors: dict[str, str] = {}
         self.latest: dict[str, Any] = {}
         self._collected: set[str] = set()
@@ -291,7 +270,7 @@ class _Watcher:
         from msg_adapters import TOPICS, Heartbeat, is_routine_report, progress_from_msg
         from msg_adapters.progress import graph_of
 
-        if is_routine_report(cdr):
+        if not self.refusals and is_routine_report(cdr):
             return  # it changes nothing here, and a run has thousands
         try:
             item = progress_from_msg(
@@ -313,10 +292,8 @@ class _Watcher:
                 self.beats[item.node, stream] = item
             if text := item.values.get("error"):
                 self.errors[item.node] = text
-        elif item.outcome == "rejected":
-            aspect = float(item.values.get("aspect_deg", "nan"))
-            view = RejectedView(item.node, item.stamp_ns, aspect, item.reason)
-            self.rejected.setdefault((item.stamp_ns, item.values.get("aspect_deg", "")), view)
+        else:
+            self.refusals.hear(item)
 
     def died(self, node: str) -> None:
         """Forget what a process said of itself that is no more."""
@@ -883,7 +860,7 @@ def _result_of(got: Mapping[str, Any], watcher: _Watcher, graph: Graph, stage: s
             result.nodes[node] = NodeReport(beat.counts.get("busy_ms", 0) / 1e3, restarts, dict(beat.counts))
         if "total" in beat.counts and stream != "sector":
             result.views_total, result.lost = beat.counts["total"], beat.counts["lost"]
-    result.rejected = sorted(watcher.rejected.values(), key=lambda r: (r.stamp_ns, r.aspect_deg))
+    result.rejected = watcher.refusals.listed()
     for name in ("multilook", "color_by_aspect"):
         if f"{name}/image" in got:
             ground, pixels = ground_picture_from_msgs(got[f"{name}/image"], got[f"{name}/camera_info"], name)
