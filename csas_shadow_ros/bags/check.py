@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from csas_shadow_ros.core.errors import BagError, CsasError, check_type
-from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, Track, View
+from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, Track, View, place_text
 from csas_shadow_ros.core.geometry.pixels import check_finite_pixels
 from msg_adapters.camera_info import SectorInfo
 from msg_adapters.pairs import (
@@ -793,6 +793,7 @@ def check_spectrum_sign(image: CoherentImage, track: Track) -> Iterator[tuple[st
         return  # said already
     # Imported here: a bag of views is checked without the weight of the whole method.
     from csas_shadow_ros.core.search.bodies import LEAVES, spectrum_sign_evidence
+    from csas_shadow_ros.core.shape.result import OTHER_SIGN
 
     try:
         evidence, search = spectrum_sign_evidence(image, track)
@@ -808,11 +809,11 @@ def check_spectrum_sign(image: CoherentImage, track: Track) -> Iterator[tuple[st
     else:
         yield INFO, str(evidence), ""
     for left in () if search is None else search.left_out:
+        remedies = []
         if LEAVES in left.reason:
-            x, y = left.position_m
-            yield (
-                WARNING,
-                f"something stands at ({x + 0.0:.2f}, {y + 0.0:.2f}) m: {left.reason}",
-                "Process a larger scene: a body with its shadows off the image cannot be judged."
-                + ("" if left.reason.startswith(LEAVES) else " Check spectrum_sign (camera_info.d[3])."),
-            )
+            remedies.append("Process a larger scene: a body with its shadows off the image cannot be judged.")
+        if left.reason.startswith(OTHER_SIGN):
+            remedies.append("Check spectrum_sign (camera_info.d[3]).")
+        if remedies:
+            where = place_text(left.position_m)
+            yield WARNING, f"something stands at {where}: {left.reason}", " ".join(remedies)

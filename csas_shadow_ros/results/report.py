@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..core.geometry import CoherentImage, Place, Track
+from ..core.geometry import CoherentImage, Place, Track, place_text
 from ..core.parameters import CarvingParameters, PipelineParameters
 from ..core.shape.mesh import Dimensions
 from ..core.shape.result import Result, ViewEvidence
@@ -507,16 +507,14 @@ def _object_lines(report: Mapping[str, Any]) -> list[str]:
         if entry["files"][0] == "grid.npz":
             continue  # the target: told above
         d = entry["dimensions"]
-        x, y = d["position_m"]
         lines.append(
             f"object {entry['number']}: {_sides(d)}, {d['volume_m3']:.4f} m³,"
-            f" heading {d['heading_deg']:.1f}°, at ({x + 0.0:.2f}, {y + 0.0:.2f}) m,"
+            f" heading {d['heading_deg']:.1f}°, at {place_text(d['position_m'])},"
             f" {entry['views_used']} views"
             + ("" if (t := entry.get("truth")) is None else f"; in truth {_sides(t)}")
         )
     for left in report.get("objects_left_out", []):
-        x, y = left["position_m"]
-        lines.append(f"no object at ({x + 0.0:.2f}, {y + 0.0:.2f}) m: {left['reason']}")
+        lines.append(f"no object at {place_text(left['position_m'])}: {left['reason']}")
     return lines
 
 

@@ -34,7 +34,8 @@ from csas_shadow_ros.core.geometry import (
 )
 from csas_shadow_ros.core.imaging.subaperture import SubApertures
 from csas_shadow_ros.core.parameters import SubApertureParameters
-from csas_shadow_ros.core.search.bodies import SignEvidence
+from csas_shadow_ros.core.search.bodies import LEAVES, Search, SignEvidence
+from csas_shadow_ros.core.shape.result import OTHER_SIGN, LeftOut
 from csas_shadow_ros.run_bag import refuse_contradictions
 from msg_adapters import RosbagsMessages, coherent_image_to_msgs, track_to_msg, view_to_msgs
 
@@ -413,6 +414,21 @@ def test_a_spectrum_sign_that_cannot_be_checked_is_a_warning(monkeypatch):
     monkeypatch.setattr("csas_shadow_ros.core.search.bodies.spectrum_sign_evidence", fail)
     ((level, problem, _),) = check_spectrum_sign(annulus_image(), circle())
     assert (level, problem) == ("warning", "the spectrum sign cannot be checked: no aspect is covered")
+
+
+@pytest.mark.parametrize(
+    ("reason", "remedy"),
+    [
+        (LEAVES, "Process a larger scene: a body with its shadows off the image cannot be judged."),
+        (f"{OTHER_SIGN} a faint body throws a shadow here", "Check spectrum_sign (camera_info.d[3])."),
+    ],
+)
+def test_check_of_the_sign_warns_of_what_a_run_would_leave_undecided(monkeypatch, reason, remedy):
+    search = Search((), None, None, (LeftOut((1.0, -0.001), reason), LeftOut((0.0, 0.0), "it is too low")))
+    asked = "csas_shadow_ros.core.search.bodies.spectrum_sign_evidence"
+    monkeypatch.setattr(asked, lambda i, t: (SignEvidence(-1, 0.0, 0.0), search))
+    _, *warned = check_spectrum_sign(annulus_image(), circle())
+    assert warned == [("warning", f"something stands at (1.00, 0.00) m: {reason}", remedy)]
 
 
 def test_the_spectrum_sign_is_checked_with_the_method_itself(tmp_path):

@@ -24,6 +24,7 @@ from .frames import (
     cross_range_axis,
     down_range_axis,
     one_frame,
+    place_text,
     unit_to_sonar,
     wrap_angle,
 )
@@ -73,6 +74,7 @@ __all__ = [
     "one_frame",
     "origin_of",
     "passage",
+    "place_text",
     "shadow_matrix",
     "unit_to_sonar",
     "view_ground_to_pixel",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,6 +61,12 @@ def cross_range_axis(aspect_rad: float) -> FloatArray:
 def down_range_axis(aspect_rad: float) -> FloatArray:
     """Return e_r = -û(θ), along which a view's rows grow, away from the sonar."""
     return -unit_to_sonar(aspect_rad)
+
+
+def place_text(position_m: Sequence[float]) -> str:
+    """Write a place of the scene as "(1.20, -0.35) m"; never as -0.00."""
+    x, y = (round(value, 2) + 0.0 for value in position_m)
+    return f"({x:.2f}, {y:.2f}) m"
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,16 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from ..errors import NoTargetError, ViewError
-from ..geometry import TWO_PI, CoherentImage, Track, View, ViewInfo, fit_target_to_focus, wrap_angle
+from ..geometry import (
+    TWO_PI,
+    CoherentImage,
+    Track,
+    View,
+    ViewInfo,
+    fit_target_to_focus,
+    place_text,
+    wrap_angle,
+)
 from ..imaging.enhancement import enhance
 from ..imaging.subaperture import Spectrum
 from ..parameters import (
@@ -198,8 +207,8 @@ def decide_by_views(
     chosen = spread_views(views(), _SEARCH_VIEWS)
     if stage in ("likelihood", "shadow_mask"):
         try:
-            x, y = fit_target_to_focus([view.info for view in chosen])
-            hint = f" (its views were focused on ({x:.2f}, {y:.2f}) m)"
+            focus = fit_target_to_focus([view.info for view in chosen])
+            hint = f" (its views were focused on {place_text(focus)})"
         except ValueError:
             hint = ""
         raise NoTargetError(

@@ -8,6 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry import place_text
 from .mesh import Dimensions
 from .result import OTHER_SIGN, Quality, Result
 from .volume import VoxelGrid
@@ -101,7 +102,7 @@ def _decide(result: Result, reasons: list[str]) -> int:
         # Of empty seabeds 3 in 40 have such a faint body too, as many as under the stated sign.
         elif faint := [one for one in result.left_out if one.reason.startswith(OTHER_SIGN)]:
             told = "nothing tells the spectrum_sign"
-            reasons += [f"{told}: {one.reason}, at {_at(one.position_m)}" for one in faint]
+            reasons += [f"{told}: {one.reason}, at {place_text(one.position_m)}" for one in faint]
             worst = 1
     return worst
 
@@ -176,22 +177,19 @@ def _half_along(size: Dimensions, way: NDArray[np.float64]) -> float:
     return 0.5 * (size.length_m * abs(math.cos(turned)) + size.width_m * abs(math.sin(turned)))
 
 
-def _at(position_m: tuple[float, float]) -> str:
-    x, y = position_m
-    return f"({x + 0.0:.2f}, {y + 0.0:.2f}) m"
-
-
 def _candidates(result: Result) -> list[str]:
     """Name what may be an object and could not be carved."""
     found = [
-        f"a candidate at {_at(left.position_m)}: {left.reason}" for left in result.left_out if left.strong
+        f"a candidate at {place_text(left.position_m)}: {left.reason}"
+        for left in result.left_out
+        if left.strong
     ]
     target = result.target
     # A volume that was given tells nothing of a shadow in it; one that the search found does.
     if target is not None and result.final and not math.isnan(target.evidence):
         found.insert(
             0,
-            f"a candidate at {_at(target.position_m)}: its shadow is too thin or too faint to carve"
+            f"a candidate at {place_text(target.position_m)}: its shadow is too thin or too faint to carve"
             " from single views, expected finer resolution or more contrast",
         )
     return found
