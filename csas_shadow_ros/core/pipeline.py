@@ -14,14 +14,13 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
-from .errors import ViewError, check_range
-from .geometry import CoherentImage, Track, View
-from .geometry.passage import passage
+from .errors import ViewError
+from .geometry import CoherentImage, Track, View, passage
 from .imaging.enhancement import enhance
 from .imaging.likelihood import Levels, outside_likelihood, view_levels
 from .imaging.segmentation import segment_shadow
 from .imaging.subaperture import Spectrum, SubApertures
-from .parameters import MAX_OBJECTS, MOST_OBJECTS, PipelineParameters
+from .parameters import MAX_OBJECTS, PipelineParameters
 from .reconstruction import Reconstruction
 from .search.decision import Decision, decide_by_image
 from .shape.hollows import EchoLook
@@ -72,9 +71,7 @@ class ProcessedView:
     @cached_property
     def likelihood(self) -> View | None:
         """l_out = (p_r / (p_r + p_s))² (4.2)."""
-        return (
-            None if self.shadow is None else outside_likelihood(self.shadow, self.p.likelihood, self.levels)
-        )
+        return self.shadow and outside_likelihood(self.shadow, self.p.likelihood, self.levels)
 
     @cached_property
     def mask(self) -> View | None:
@@ -96,8 +93,7 @@ class ProcessedView:
         """Dark pixels of the view round the target (beyond the paper: hollows)."""
         if self.levels is None or self.shadow is None or self.target is None:
             return None
-        volume = self.target.volume(self.p.carving.voxel_size_m)
-        return EchoLook.of(self.levels, self.shadow.info, volume)
+        return EchoLook.of(self.levels, self.shadow.info, self.target.volume(self.p.carving.voxel_size_m))
 
 
 def process(view: View, stage: str, decision: Decision, p: PipelineParameters) -> list[ProcessedView]:
@@ -131,7 +127,6 @@ def run(
         a target position that was given.
     """
     p = parameters or PipelineParameters()
-    check_range("max_objects", max_objects, 1, MOST_OBJECTS)
     began = time.perf_counter()
     name = int(track.stamps_ns[0]) if run_ns is None else run_ns
     track = passage(track, image_ns=image.stamp_ns or None).track  # what lies off the circle tells nothing

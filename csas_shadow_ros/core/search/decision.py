@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
-from ..errors import NoTargetError, ViewError
+from ..errors import NoTargetError, ViewError, check_range
 from ..geometry import (
     TWO_PI,
     CoherentImage,
@@ -20,6 +20,7 @@ from ..imaging.enhancement import enhance
 from ..imaging.subaperture import Spectrum
 from ..parameters import (
     MAX_OBJECTS,
+    MOST_OBJECTS,
     PipelineParameters,
     ShadowParameters,
     TargetParameters,
@@ -111,7 +112,10 @@ def decide(
         If the shadows contradict the stated spectrum sign.
     NoTargetError
         If a position is given, its volume's size is automatic, and no body is there.
+    ParameterError
+        If `max_objects` is out of range.
     """
+    check_range("max_objects", max_objects, 1, MOST_OBJECTS)
     if sign is not None:
         sign.check()
     p, found = parameters, search.targets if search is not None else ()
