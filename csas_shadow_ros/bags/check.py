@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 
 from csas_shadow_ros.core.errors import BagError, CsasError, check_type
-from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, GroundGrid, Track, View, place_text
+from csas_shadow_ros.core.geometry import (
+    Acoustics,
+    CoherentImage,
+    GroundGrid,
+    Track,
+    View,
+    place_text,
+    wrap_angle,
+)
 from csas_shadow_ros.core.geometry.pixels import check_finite_pixels
 from msg_adapters.camera_info import SectorInfo
 from msg_adapters.pairs import (
@@ -77,7 +85,10 @@ _MEDIAN_OF = 1 << 20
 _LEAST_CIRCLE_M = 0.5
 #: No sonar's circle is so far from its scene: positions beyond it are of another frame.
 _MAP_M = 10_000.0
-_ONE_CLOCK = "Stamp images and poses by one clock: an image with the time when its last data came."
+_ONE_CLOCK = (
+    "Stamp images and poses by one clock, an image with the time when its last data came, and record the"
+    " track until then."
+)
 #: A stated aspect may be so far off from what the track has, beyond half a sector.
 _ASPECT_SLACK_RAD = math.radians(3.0)
 
@@ -334,7 +345,8 @@ class _Check:
         if stream_name in _IMAGES:
             # A run goes on without a sector, but not without its image.
             level = ERROR if stream_name == "image" else WARNING
-            self.say(level, topic, self.runs.not_covered(), _ONE_CLOCK, number=number, stamp_ns=stamp_ns)
+            problem = self.runs.not_covered(stamp_ns)
+            self.say(level, topic, problem, _ONE_CLOCK, number=number, stamp_ns=stamp_ns)
             return False
         return len(self.runs.names) < 2 or stream_name not in VIEW_STREAMS
 
@@ -445,7 +457,8 @@ def judge_coverage(track: Track) -> Iterator[tuple[str, str, str]]:
     arcs += f" and {len(gaps) - 8} more" if len(gaps) > 8 else ""
     problem = f"the track covers {math.degrees(track.coverage_rad):.1f} of 360 degrees; missing: {arcs}"
     if track.coverage_rad < MIN_COVERAGE_RAD:
-        why = track.doubtful[0].why(track.doubtful[0].start_rad) if track.doubtful else _not_round(track)
+        why = track.doubtful[0].why(track.doubtful[0].start_rad) if track.doubtful else ""
+        why = why or _not_round(track) or _sparse(track)
         yield (
             ERROR,
             f"{problem}: no view can be made{why and f'; {why}'}",
@@ -458,6 +471,15 @@ def judge_coverage(track: Track) -> Iterator[tuple[str, str, str]]:
         problem,
         "These arcs get no views. Record the track round the whole circle if it was flown.",
     )
+
+
+def _sparse(track: Track) -> str:
+    """Say how far apart the poses are, if most are too far from one another to connect; else empty."""
+    steps = np.abs(wrap_angle(np.diff(track.aspects_rad)))
+    step = float(np.median(steps)) if steps.size else 0.0
+    if step <= track.max_gap_rad:
+        return ""
+    return f"its poses lie {math.degrees(step):.1f}° of aspect apart (median of {steps.size} steps)"
 
 
 def _not_round(track: Track) -> str:
@@ -489,6 +511,9 @@ def judge_image(image: CoherentImage, track: Track) -> Iterator[tuple[str, str, 
         If a pixel is not finite, though it was when the image was made.
     """
     check_finite_pixels("image", image.pixels)
+    if not image.pixels.any():
+        yield ERROR, "the image holds only zeros", "Give the image that the sonar's processor made."
+        return
     if track.frame != image.frame:
         yield (
             ERROR,
@@ -712,7 +737,9 @@ def judge_energy(image: CoherentImage, track: Track) -> Iterator[tuple[str, str,
     found, expected = (energy.low_rad_m + energy.high_rad_m) / 2, (inner + outer) / 2
     shift = abs(found - expected) / (high - low)
     shifted = shift > MAX_BAND_SHIFT
-    place = _height_of_band(track, found / expected) if shifted else ""
+    # A wrong frequency or height scales the band; without its carrier it begins near K = 0.
+    whole = energy.low_rad_m / energy.high_rad_m > 0.5 * inner / outer
+    place = _height_of_band(track, found / expected) if shifted and whole else ""
     if energy.fraction >= GOOD_BAND_ENERGY and not shifted:
         return
     if energy.fraction >= GOOD_BAND_ENERGY:
@@ -732,7 +759,10 @@ def judge_energy(image: CoherentImage, track: Track) -> Iterator[tuple[str, str,
         f" rad/m{place}",
         f"With the stated sound speed that is {energy.low_rad_m * to_hz:.0f} to"
         f" {energy.high_rad_m * to_hz:.0f} Hz: check centre frequency, bandwidth and sound speed"
-        " (camera_info.d[0:3]), the pixel spacing (p), and that the image is not at baseband.",
+        " (camera_info.d[0:3]), and the pixel spacing (p)."
+        if whole
+        else "An image on its carrier has no energy near K = 0. Give complex pixels with their phase, not"
+        " amplitudes, and not at baseband.",
     )
 
 

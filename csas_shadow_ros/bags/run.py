@@ -58,7 +58,7 @@ T = TypeVar("T")
 
 #: Where a run is that is in no bag.
 IN_MEMORY = Path("in memory")
-_NO_IMAGE = "there is no full-circle image"
+_NO_IMAGE, _UNUSABLE = "there is no full-circle image", "no full-circle image can be used"
 
 
 @dataclass
@@ -137,8 +137,8 @@ class Run:
         (name,) = book.names
         run = cls(IN_MEMORY, NAMESPACE, image, track, {"image": 1}, run_ns=name, run_names=(name,))
         if image.stamp_ns and not book.runs_of(image.stamp_ns):
-            run.report(Problem("image", None, image.stamp_ns, book.not_covered()))
-            raise BagError(run.why(_NO_IMAGE))
+            run.report(Problem("image", None, image.stamp_ns, book.not_covered(image.stamp_ns)))
+            raise BagError(run.why(_UNUSABLE))
         return run
 
     def __repr__(self) -> str:
@@ -225,7 +225,7 @@ class Run:
             return self.image
         if self.counts.get("sector"):
             return self.sector_sum().image()
-        raise BagError(self.why(_NO_IMAGE))
+        raise BagError(self.why(_UNUSABLE if self.problems else _NO_IMAGE))
 
     @property
     def frame(self) -> str:
@@ -299,7 +299,7 @@ class Run:
             what = f"the stamps of {len(uncovered)} {stream_name} messages,"
             what += f" {min(uncovered)} to {max(uncovered)} ns"
             topic = absolute_name(stream(stream_name).image_topic, self.namespace)
-            self.report(Problem(topic, None, None, f"{self._runs.not_covered(what)}; they are skipped"))
+            self.report(Problem(topic, None, None, f"{self._runs.not_covered(None, what)}; they are skipped"))
 
     def report(self, problem: Problem) -> None:
         """Record a problem, each only once."""
@@ -430,7 +430,7 @@ def _one_image(run: Run, reader: BagReader, runs: BagRuns) -> CoherentImage | No
     for pair in iterate_pairs(reader, "image", run.report):
         if not runs.covers(pair.stamp_ns):
             if not runs.is_of_another(pair.stamp_ns):
-                run.report(Problem(pair.topic, pair.number, pair.stamp_ns, runs.not_covered()))
+                run.report(Problem(pair.topic, pair.number, pair.stamp_ns, runs.not_covered(pair.stamp_ns)))
             continue
         if image is not None:
             reason = "is a second image; the first is used"

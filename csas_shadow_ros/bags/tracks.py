@@ -116,9 +116,9 @@ class BagRuns:
         """Say whether a stamp is of another run of this bag."""
         return not self.covers(stamp_ns) and bool(self.book.runs_of(stamp_ns))
 
-    def not_covered(self, what: str = "its stamp") -> str:
-        """State that no track covers a stamp, and what the tracks cover."""
-        return self.book.not_covered(what)
+    def not_covered(self, stamp_ns: int | None = None, what: str = "its stamp") -> str:
+        """State that no track covers a stamp, what the tracks cover, and how far off it is."""
+        return self.book.not_covered(stamp_ns, what)
 
     @property
     def frame(self) -> str:

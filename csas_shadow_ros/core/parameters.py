@@ -183,6 +183,13 @@ class SubApertureParameters(Parameters):
     )
     check_sign: bool = bounded(True, "refuse an image if its shadows contradict its spectrum sign")
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if abs(math.remainder(360.0, self.step_deg)) > 5e-5:
+            raise ParameterError(
+                f"step_deg is {self.step_deg:g} deg; expected a divisor of 360 deg (such as 1, 2, 5)"
+            )
+
 
 @dataclass(frozen=True)
 class ShadowParameters(Parameters):

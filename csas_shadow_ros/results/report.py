@@ -572,13 +572,16 @@ def _carving_lines(report: Mapping[str, Any]) -> list[str]:
 
 def _view_lines(views: Mapping[str, Any]) -> list[str]:
     """Write how many views there were, and why some were not used."""
-    rest = views["in"] - views["used"] - views["rejected"] - views["lost"]
+    # What a node beside the way to the grid refuses may be in the grid all the same.
+    without = max(views["in"] - views["used"] - views["lost"], 0)
+    unused = min(views["rejected"], without)
+    rest = without - unused
     needless = f" {rest} not needed, as there was nothing to carve," if rest > 0 and not views["used"] else ""
     return [
-        f"views: {views['in']} in, {views['used']} in the grid, {views['rejected']} not used,"
+        f"views: {views['in']} in, {views['used']} in the grid, {unused} not used,"
         f"{needless} {views['lost']} lost",
         *(
-            f"  {n} not used{', the first' if n > 1 else ''}: {reason}"
+            f"  {n} refused{', the first' if n > 1 else ''}: {reason}"
             for reason, n in views["reasons"].items()
         ),
     ]

@@ -16,6 +16,7 @@ from csas_shadow_ros.bags.check import (
     band_energy,
     check_spectrum_sign,
     judge_band,
+    judge_coverage,
     judge_energy,
     judge_geometry,
     judge_image,
@@ -373,6 +374,40 @@ def test_check_calls_too_coarse_what_the_method_refuses_and_nothing_else(finer):
     assert found == [str(refused.value)]
     assert "expected a pixel of at most" in found[0]
     assert [*check_spectrum_sign(coarse, track)] == []
+
+
+def test_an_image_of_zeros_is_one_error():
+    """It was told that "nan %" of its energy lies in its band."""
+    image = annulus_image()
+    blank = replace(image, pixels=np.zeros_like(image.pixels))
+    ((level, problem, _),) = judge_image(blank, circle())
+    assert (level, problem) == ("error", "the image holds only zeros")
+
+
+def test_amplitudes_are_not_taken_for_a_wrong_height():
+    image = annulus_image()
+    ((level, problem, remedy),) = judge_energy(replace(image, pixels=np.abs(image.pixels) + 0j), circle())
+    assert level == "error"
+    assert "above the seabed" not in problem
+    assert "with their phase, not amplitudes, and not at baseband" in remedy
+
+
+def test_a_track_of_too_few_poses_names_how_far_apart_they_are():
+    ((level, problem, remedy),) = judge_coverage(circle(72))
+    assert level == "error"
+    assert problem.endswith("no view can be made; its poses lie 5.0° of aspect apart (median of 71 steps)")
+    assert "at most 3 degrees apart" in remedy
+    # Angles in degrees that were put into cos and sin.
+    aspects = np.arange(360.0)
+    positions_m = np.column_stack([75 * np.cos(aspects), 75 * np.sin(aspects), np.full(360, 18.0)])
+    mixed = Track(circle().stamps_ns, positions_m)
+    ((_, problem, _),) = judge_coverage(mixed)
+    assert "its poses lie 57.3° of aspect apart" in problem
+
+
+def test_a_gap_ends_within_the_circle():
+    cut = Track(circle().stamps_ns[10:350], circle().positions_m[10:350])
+    assert [str(gap) for gap in cut.gaps] == ["349.0° to 10.0°"]
 
 
 def test_a_track_over_the_image_or_beside_it_is_an_error():

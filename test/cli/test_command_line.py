@@ -23,7 +23,7 @@ from csas_shadow_ros.core.geometry import Acoustics, CoherentImage, Track
 from csas_shadow_ros.core.parameters import STAGES
 from csas_shadow_ros.parameter_file import pipeline_parameters, read_parameter_file
 from csas_shadow_ros.results import ResultsError, ResultsWriter, is_results_folder, read_report
-from csas_shadow_ros.results.report import _reasons
+from csas_shadow_ros.results.report import _reasons, summary
 from csas_shadow_ros.simulation import get_profile, simulate_bag
 from csas_shadow_ros.simulation.targets import box, join_bodies
 from msg_adapters.topics import STREAMS
@@ -237,6 +237,20 @@ def test_the_summary_has_found_and_true_dimensions_side_by_side(results):
     assert "0.800 m" in length
     assert any("36 in, 36 in the grid, 0 not used, 0 lost" in line for line in lines)
     assert Said("info", results).out.startswith(lines[0])
+
+
+@pytest.mark.parametrize(
+    ("used", "lost", "unused"),
+    [(36, 0, "0 not used, 0 lost"), (30, 0, "6 not used, 0 lost"), (33, 3, "0 not used, 3 lost")],
+)
+def test_a_view_that_is_in_the_grid_is_not_one_that_was_not_used(results, used, lost, unused):
+    """A classifier beside the graph refused every view: "36 in the grid, 36 not used"."""
+    report = read_report(results)
+    reasons = {"my_classifier: not mine": 36}
+    report["views"] |= {"used": used, "lost": lost, "rejected": 36, "reasons": reasons}
+    lines = summary(report).splitlines()
+    assert f"views: 36 in, {used} in the grid, {unused}" in lines
+    assert "  36 refused, the first: my_classifier: not mine" in lines
 
 
 def test_reasons_that_differ_in_numbers_alone_are_counted_under_the_first_with_its_numbers():
@@ -498,7 +512,7 @@ def test_a_band_that_the_image_contradicts_is_refused_and_not_called_no_object(
 @pytest.mark.parametrize(
     ("poses", "expected"),
     [
-        (slice(19, None, 20), "no view can be made. Record the track"),
+        (slice(19, None, 20), "no view can be made; its poses lie "),
         (slice(-20, None), "none of 36 views could be made"),
     ],
     ids=["too far apart", "too short an arc"],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -192,6 +193,17 @@ def test_a_result_that_does_not_explain_the_pictures_says_so(unexplained, lit, q
     assert result.quality.verdict == quality
     assert word in "; ".join(result.quality.reasons)
     assert explained_share(result) == pytest.approx(1.0 - unexplained)
+
+
+@pytest.mark.parametrize(
+    ("refused", "quality"), [(0, "good"), (3, "limited"), (10, "limited"), (11, "not trustworthy")]
+)
+def test_views_that_were_refused_cost_trust_and_most_of_them_all(refused, quality):
+    rejected = {float(i): "it is dark" for i in range(refused)}
+    composites: Any = object()  # there are views
+    result = Result(views_used=10, arc_rad=2.0 * math.pi, rejected=rejected, composites=composites)
+    judge(result)
+    assert result.quality.verdict == quality
 
 
 def test_no_reason_holds_what_separates_reasons():

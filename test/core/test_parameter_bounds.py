@@ -122,6 +122,12 @@ def test_a_whole_number_is_held_to_its_bounds_too(value):
     assert Whole(count=4.0).count == 4
 
 
+@pytest.mark.parametrize("step_deg", [7.0, 0.1745])
+def test_a_step_that_does_not_divide_the_circle_is_refused_at_once(step_deg):
+    with pytest.raises(ParameterError, match=rf"step_deg is {step_deg:g} deg; expected a divisor of 360 deg"):
+        SubApertureParameters(step_deg=step_deg)
+
+
 def test_an_unknown_name_is_refused_and_the_known_ones_are_told():
     with pytest.raises(
         ParameterError, match=r"unknown parameter 'apperture'; expected one of: aperture_deg, step"

@@ -211,10 +211,10 @@ def test_an_image_that_no_track_covers_is_refused_in_the_words_of_run(off_s, tin
     told = reason_of(lambda: csas.reconstruct(csas.Run.of(stray, track)))
     assert reason_of(lambda: csas.reconstruct(SimpleNamespace(image=stray, track=track))) == told
     first, last = track.stamps_ns[[0, -1]]
-    assert f"no track covers its stamp: the track covers {first} to {last} ns" in told
+    assert f"no track covers its stamp: the track covers {first} to {last} ns; it lies " in told
     csas.write_run(tmp_path / "stray", stray, track)
     of_bag = reason_of(lambda: csas.process_bag(tmp_path / "stray", tmp_path / "out", figures=False))
-    fault = f": there is no full-circle image: {{}}image{{}} ({stray.stamp_ns} ns): no track covers its stamp"
+    fault = f": no full-circle image can be used: {{}}image{{}} ({stray.stamp_ns} ns): no track covers its"
     assert told.startswith(f"in memory{fault.format('', '')}")
     assert of_bag.startswith(f"{tmp_path / 'stray'}{fault.format('/csas/', ' message 0')}")
     assert of_bag.partition("no track covers")[2] == told.partition("no track covers")[2]

@@ -264,13 +264,20 @@ class TrackBook:
         run = self._run(run_ns)
         return run.first, run.last
 
-    def not_covered(self, what: str = "its stamp") -> str:
-        """State that no track covers a stamp, and what the tracks cover."""
+    def not_covered(self, stamp_ns: int | None = None, what: str = "its stamp") -> str:
+        """State that no track covers a stamp, what the tracks cover, and how far off it is."""
         spans = [self.span(name) for name in self.names]
         named = ", ".join(f"{first} to {last} ns" for first, last in spans[:4])
         named += f" and {len(spans) - 4} more" if len(spans) > 4 else ""
         tracks = "the track covers" if len(spans) == 1 else "the tracks cover"
-        return f"no track covers {what}: {tracks} {named}"
+        text = f"no track covers {what}: {tracks} {named}"
+        if stamp_ns is None or not spans:
+            return text
+        # By which a clock of other units, or a track that ends early, is known.
+        early = [(first - stamp_ns, "before the first pose") for first, _ in spans if stamp_ns < first]
+        late = [(stamp_ns - last, "after the last pose") for _, last in spans if stamp_ns > last]
+        off, way = min(early + late)
+        return f"{text}; it lies {off / 1e9:.6g} s {way}"
 
     def track(self, run_ns: int) -> Track:
         """Return all poses of a run; the same object until another piece arrives.

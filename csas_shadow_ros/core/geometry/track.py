@@ -25,7 +25,8 @@ class AspectGap:
 
     def __str__(self) -> str:
         start = math.degrees(self.start_rad) % 360.0
-        return f"{start:.1f}° to {start + math.degrees(self.width_rad):.1f}°"
+        end = start + math.degrees(self.width_rad)
+        return f"{start:.1f}° to {end - 360.0 if end > 360.0 + 1e-9 else end:.1f}°"
 
 
 @dataclass(frozen=True)

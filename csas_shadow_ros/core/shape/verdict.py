@@ -18,7 +18,8 @@ from .volume import VoxelGrid
 _WHOLE_ARC = 0.75
 #: So many of the views (share) may be refused before the result counts as limited. Consensus carving removes
 #: a voxel that 3 % of its views contradict, so losing a tenth of them hardly moves an edge; a gap in the
-#: circle is told by the arc as well.
+#: circle is told by the arc as well. Where most were refused, what is wrong with them may be wrong with the
+#: rest.
 _MOST_REJECTED = 0.1
 #: Segmented shadow that what was found does not cast (share, mean over the views), above which a result is
 #: limited, and above which it is not to be trusted. Five simulated boxes and a ramp left 0.2 to 2.5 % (8 to
@@ -118,7 +119,7 @@ def _views_of(result: Result, reasons: list[str]) -> int:
     if refused > _MOST_REJECTED * (refused + result.views_used):
         first = next(iter(result.rejected.values()))
         reasons.append(f"{refused} of {refused + result.views_used} views were not used: {first}")
-        worst = max(worst, 1)
+        worst = max(worst, 2 if refused > result.views_used else 1)
     if result.views_lost:
         of = result.views_used + refused + result.views_lost
         reasons.append(f"{result.views_lost} of {of} views were lost on their way")
@@ -234,7 +235,10 @@ def _too_high(result: Result) -> str:
     least = result.dimensions.intervals["height_m"][0]
     if len(ends) < _LEAST_ENDS or max(ends) >= least:
         return ""
-    return f"no shadow reaches as far as the height says: {max(ends):.2f} m at most, expected {least:.2f} m"
+    return (
+        f"no shadow reaches as far as the height says: the longest tells {max(ends):.2f} m, and the interval"
+        f" begins at {least:.2f} m"
+    )
 
 
 def explained_share(result: Result) -> float | None:
