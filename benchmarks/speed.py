@@ -547,7 +547,7 @@ def lines(report: Report) -> list[tuple[str, str, str, str]]:
         r = c["voxel_views_per_s"] / 1e6
         add("carving alone, million voxel-views a second", f"{r:.0f}", ">= 400", r >= 400)
         r = c["with_second_look_per_s"] / 1e6
-        add("carving with the second look, the same", f"{r:.0f}", ">= 400", r >= 400)
+        add("carving with the second look, the same", f"{r:.0f}", "-", None)
     if c := report.get("graph"):
         r = c["ratio"]
         add("node graph against the pipeline in one process", f"{r:.2f} x", "<= 1.5 x", r <= 1.5)
