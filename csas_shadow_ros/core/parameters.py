@@ -88,6 +88,10 @@ class Parameters:
         Naming the parameter, its value and the bounds.
     """
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        equal_where_nan(cls)
+
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value, name, meta = getattr(self, field.name), field.name, field.metadata
@@ -294,7 +298,6 @@ VIEW_STAGES: tuple[Stage, ...] = get_args(Stage)
 START_FROM: tuple[StartFrom, ...] = get_args(StartFrom)
 
 
-@equal_where_nan
 @dataclass(frozen=True)
 class PlaceParameters(Parameters):
     """Place on earth: a datum, instead of topic origin."""

@@ -11,16 +11,23 @@ from typing import Any
 
 import pytest
 
-import csas_shadow_ros.core
+import csas_shadow_ros
+import msg_adapters
 from csas_shadow_ros.core.geometry.place import Place
 from csas_shadow_ros.core.parameters import PlaceParameters
 
 
 def dataclasses_with_nan() -> list[type[Any]]:
-    """Find every public frozen dataclass of core/ with a field that is NaN where nothing is known."""
+    """Find every public frozen dataclass with a field that is NaN where nothing is known."""
     found = {}
-    for module in pkgutil.walk_packages(csas_shadow_ros.core.__path__, "csas_shadow_ros.core."):
-        for name, one in vars(importlib.import_module(module.name)).items():
+    modules = [
+        module.name
+        for package in (csas_shadow_ros, msg_adapters)
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+        if not module.name.endswith("__main__")
+    ]
+    for module_name in modules:
+        for name, one in vars(importlib.import_module(module_name)).items():
             if not (isinstance(one, type) and dataclasses.is_dataclass(one)):
                 continue
             defaults = [f.default for f in dataclasses.fields(one)]
