@@ -860,7 +860,7 @@ def _result_of(got: Mapping[str, Any], watcher: _Watcher, graph: Graph, stage: s
             result.nodes[node] = NodeReport(beat.counts.get("busy_ms", 0) / 1e3, restarts, dict(beat.counts))
         if "total" in beat.counts and stream != "sector":
             result.views_total, result.lost = beat.counts["total"], beat.counts["lost"]
-    result.rejected = watcher.refusals.listed()
+    result.rejected = watcher.refusals.listed(result.result.evidence)
     for name in ("multilook", "color_by_aspect"):
         if f"{name}/image" in got:
             ground, pixels = ground_picture_from_msgs(got[f"{name}/image"], got[f"{name}/camera_info"], name)
