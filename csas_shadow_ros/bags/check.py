@@ -613,6 +613,12 @@ def judge_geometry(grid: GroundGrid, track: Track) -> Iterator[tuple[str, str, s
         )
         return
     centre_x, centre_y, radius, _ = track.circle
+    if radius > _MAP_M:
+        yield (
+            WARNING,
+            f"the track's circle has a radius of {radius:.6g} m; expected less than {_MAP_M:g} m of a sonar",
+            "Give positions in metres.",
+        )
     middle = grid.centre_m
     off = math.hypot(middle[0] - centre_x, middle[1] - centre_y)
     if math.degrees(track.coverage_rad) > 300 and off > radius:

@@ -405,6 +405,14 @@ def test_a_track_of_too_few_poses_names_how_far_apart_they_are():
     assert "its poses lie 57.3° of aspect apart" in problem
 
 
+def test_a_circle_that_no_sonar_flies_is_told():
+    grid = GroundGrid.centred(64, 64, 0.002)
+    ((level, problem, _),) = judge_geometry(grid, circle(radius=75_000.0, height=18_000.0))
+    assert level == "warning"
+    assert "radius of 75000 m" in problem
+    assert [*judge_geometry(grid, circle())] == []
+
+
 def test_a_gap_ends_within_the_circle():
     cut = Track(circle().stamps_ns[10:350], circle().positions_m[10:350])
     assert [str(gap) for gap in cut.gaps] == ["349.0° to 10.0°"]

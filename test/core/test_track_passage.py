@@ -211,7 +211,7 @@ def test_an_image_takes_the_lap_that_ends_at_its_stamp(stamp, first):
     found = passage(whole, image_ns=int(whole.stamps_ns[stamp]))
     assert kept(whole, found) == [(first, first + 719)]
     assert found.track.gaps == ()
-    assert "the track passes 0.0° to 360.0° 2 times, up to 6.0 m apart" in found.notes[0]
+    assert "the track passes the whole circle 2 times, up to 6.0 m apart" in found.notes[0]
 
 
 @pytest.mark.parametrize(("stamp", "first"), [(719, 0), (1439, 720)])

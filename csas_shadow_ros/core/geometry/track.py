@@ -24,6 +24,8 @@ class AspectGap:
     width_rad: float
 
     def __str__(self) -> str:
+        if self.width_rad > TWO_PI - 1e-9:
+            return "the whole circle"
         start = math.degrees(self.start_rad) % 360.0
         end = start + math.degrees(self.width_rad)
         return f"{start:.1f}° to {end - 360.0 if end > 360.0 + 1e-9 else end:.1f}°"
