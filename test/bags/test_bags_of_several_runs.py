@@ -366,8 +366,8 @@ TAKEN = {
         FLOWN,
         "299 of 659 track poses are not on the circle",
     ),
-    "a lap 6 m higher before": (flown(np.vstack([_UP, FLOWN]), 360), FLOWN, "the whole circle 2 times, up to"),
-    "a lap 6 m higher after": (flown(np.vstack([FLOWN, _UP])), FLOWN, "the whole circle 2 times, up to 6.0 m"),
+    "a lap 6 m higher before": (flown(np.vstack([_UP, FLOWN]), 360), FLOWN, "whole circle 2 times, up to"),
+    "a lap 6 m higher after": (flown(np.vstack([FLOWN, _UP])), FLOWN, "whole circle 2 times, up to 6.0 m"),
     "a spiral": (flown(_SPIRAL, 360), _SPIRAL[360:], "the track sinks from 21.0 to 18.0 m height"),
     "standing at the start": (
         flown(np.vstack([np.repeat(FLOWN[:1], 300, 0), FLOWN]), 300),

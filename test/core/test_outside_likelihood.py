@@ -119,6 +119,24 @@ def test_the_contrast_is_measured_within_1_db(contrast_db, share):
     assert 0.3 * share < levels.shadow_fraction < 1.1 * share
 
 
+@pytest.mark.parametrize("contrast_db", [5.0, 6.0, 7.0])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_faint_shadow_of_a_target_is_measured_as_well(contrast_db, seed):
+    """It was taken for the assumed 12 dB, by which most of it is no shadow."""
+    amplitude = speckle(seed)
+    amplitude[shadow_boxes(0.1)] *= 10 ** (-contrast_db / 20)
+    levels = view_levels(make_view(amplitude))
+    assert levels.estimated
+    assert 20 * math.log10(levels.contrast) == pytest.approx(contrast_db, abs=1.0)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_faint_patch_is_no_shadow_where_no_target_is_known(seed):
+    amplitude = speckle(seed)
+    amplitude[shadow_boxes(0.1)] *= 10 ** (-5.0 / 20)
+    assert not view_levels(make_view(amplitude), target=False).estimated
+
+
 def test_a_view_without_shadow_falls_back_on_the_assumed_contrast():
     levels = view_levels(make_view(speckle(5)), LikelihoodParameters(shadow_contrast_db=14.0))
     assert not levels.estimated

@@ -101,8 +101,10 @@ def test_a_faint_box_is_found_or_named_and_its_seabed_alone_is_not():
     assert search.best.stands
     assert max(map(abs, search.best.position_m)) < 0.1
     result = run(with_box.image, with_box.track, COARSE)
-    assert result.verdict == "undecided"
-    assert "a candidate at" in result.quality.reasons[0]
+    assert (result.verdict, result.quality.verdict) == ("object", "not trustworthy")
+    assert "of the shadow is unexplained" in result.quality.reasons[0]
+    assert result.dimensions.length_m == pytest.approx(0.8, abs=0.12)
+    assert result.dimensions.width_m == pytest.approx(0.4, abs=0.12)
     alone = simulate("tiny", "empty", seed=3, faults=faint)
     result = run(alone.image, alone.track, COARSE)
     assert (result.verdict, result.quality.verdict, result.left_out) == ("no object", "good", [])

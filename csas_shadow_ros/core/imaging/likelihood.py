@@ -32,6 +32,10 @@ _MIN_PIXELS = 256
 _LEAST_CELLS = 9.0
 #: A shadow less than 4 dB under the seabed is its own speckle.
 _MIN_CONTRAST2 = 10.0**0.4
+#: Contrasts (power ratios: 9 and 6 dB) to start from where the first one finds no shadow of a target. Of the
+#: population's scenes 60 to 119, on which they were not chosen, ten bodies gain 0.06 to 0.44 of IoU with the
+#: hull and one loses 0.07; the mean rises from 0.64 to 0.69.
+_FAINTER = (10.0**0.9, 10.0**0.6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,7 +379,9 @@ def box_mean(power: FloatImage, known: NDArray[np.bool_], radius_px: tuple[int, 
     return np.asarray(np.divide(total, weight, out=total), dtype=np.float32)
 
 
-def fit_contrast(local: LocalMeans, start_db: float) -> tuple[float, float] | None:
+def fit_contrast(
+    local: LocalMeans, start_db: float, *, fainter: bool = False
+) -> tuple[float, float] | None:
     """Measure σ_r/σ_s on the view's own shadows.
 
     Shadows are found first, as patches of low mean power, and the level is that of their interiors:
@@ -387,17 +393,29 @@ def fit_contrast(local: LocalMeans, start_db: float) -> tuple[float, float] | No
         Of the view's power (i/σ_r)²/2.
     start_db : float
         Contrast to start from.
+    fainter : bool
+        Where that finds no shadow, look for a fainter one.
 
     Returns
     -------
     (contrast, shadow_fraction) or None
         None where the view holds no shadow to measure: the fit is then refused rather than trusted.
     """
-    contrast2 = 10.0 ** (start_db / 10.0)
     # A pixel is inside a shadow if all of its neighbours are dark: if the brightest of them is.
     # Halfway between the two levels in dB; boxes of so many looks seldom cross it by chance. No threshold
     # that is asked for below lies higher than that of the least contrast.
-    levels, powers = local.interiors(float(np.float32(min(contrast2, _MIN_CONTRAST2) ** -0.5)))
+    started = 10.0 ** (start_db / 10.0)
+    levels, powers = local.interiors(float(np.float32(min(started, _MIN_CONTRAST2) ** -0.5)))
+    for contrast2 in (started, *(c for c in _FAINTER if fainter and c < started)):
+        if (fit := _fitted(levels, powers, contrast2, local)) is not None:
+            return fit
+    return None
+
+
+def _fitted(
+    levels: FloatImage, powers: FloatImage, contrast2: float, local: LocalMeans
+) -> tuple[float, float] | None:
+    """Measure the contrast on the interiors of what is dark by half of a first guess."""
     count = 0
     for _ in range(3):
         interior = powers[levels < contrast2**-0.5]
@@ -410,7 +428,9 @@ def fit_contrast(local: LocalMeans, start_db: float) -> tuple[float, float] | No
     return math.sqrt(contrast2), count / local.total_known
 
 
-def view_levels(view: View, parameters: LikelihoodParameters | None = None) -> Levels:
+def view_levels(
+    view: View, parameters: LikelihoodParameters | None = None, *, target: bool = True
+) -> Levels:
     """Estimate a view's σ_r and σ_s.
 
     Parameters
@@ -419,6 +439,8 @@ def view_levels(view: View, parameters: LikelihoodParameters | None = None) -> L
         Amplitude after enhancement.
     parameters : LikelihoodParameters
         Local or global seabed level; measured or assumed contrast.
+    target : bool
+        Whether a target throws its shadow here. Where none is known to, a faint patch is no shadow.
 
     Raises
     ------
@@ -435,7 +457,9 @@ def view_levels(view: View, parameters: LikelihoodParameters | None = None) -> L
     seabed = np.empty(tuple(-(-n // 8) for n in amplitude.shape), np.float32)
     _relative_power(amplitude, seabed_level(amplitude, p.background), power, known, spans, seabed)
     local = LocalMeans(power, known, view.info.cell_px, spans)
-    fit = fit_contrast(local, p.shadow_contrast_db) if p.shadow_level == "estimated" else None
+    fit = None
+    if p.shadow_level == "estimated":
+        fit = fit_contrast(local, p.shadow_contrast_db, fainter=target)
     contrast, fraction = fit or (10.0 ** (p.shadow_contrast_db / 20.0), math.nan)
     return Levels(_median(seabed), contrast, fraction, fit is not None, local)
 

@@ -207,7 +207,7 @@ def _search_looks(views: list[View], extent_m: float, workers: int = 2) -> list[
     def look(_: int) -> _Look | None:
         view = views.pop()
         try:
-            levels = view_levels(view, parameters)
+            levels = view_levels(view, parameters, target=False)
             return _Look(outside_likelihood(view, parameters, levels), _power(view, levels, parameters))
         except ViewError:
             return None  # a view without levels has nothing to say here; it is reported where it counts
