@@ -34,8 +34,8 @@ _LEAST_CELLS = 9.0
 _MIN_CONTRAST2 = 10.0**0.4
 #: Contrast (power ratio, 6 dB) to start from where the first guess finds no shadow of a target. Of the
 #: population's scenes 60 to 119, on which it was not chosen, ten bodies gain 0.06 to 0.44 of IoU with the
-#: hull by a second start, and one loses 0.07. From 4 dB, the least contrast, the 17 bodies that change most lose
-#: 0.006 in the mean, from 9 dB 0.1.
+#: hull by a second start, and one loses 0.07. From 4 dB, the least contrast, the 17 bodies that change most
+#: lose 0.006 in the mean, from 9 dB 0.1.
 _FAINTER2 = 10.0**0.6
 
 
