@@ -288,13 +288,22 @@ def reconstruct(
     result = run(simulated.image, simulated.track, parameters, on_view=keep, workers=1)
     if result.grid is None or result.other_grid is None:
         return result, {}
-    hard = Carver(result.grid.volume, CarvingParameters(method="hard"))
+    grids = {DEFAULT_METHOD: result.grid, "soft": result.other_grid}
+    for method in METHODS:
+        if method not in grids:
+            grids[method] = _carved(masks, result.grid.volume, method)
+    return result, grids
+
+
+def _carved(masks: Sequence[View], volume: Volume, method: str) -> VoxelGrid:
+    """Carve silhouettes by another method than the run's."""
+    carver = Carver(volume, CarvingParameters(method=method))
     for mask in masks:
         try:
-            hard.integrate(require_silhouette(mask))
+            carver.integrate(require_silhouette(mask))
         except ViewError:  # the chain leaves out a view without a silhouette, whatever carves
             continue
-    return result, {DEFAULT_METHOD: result.grid, "hard": hard.grid(), "soft": result.other_grid}
+    return carver.grid()
 
 
 def lattice_over(volume: Volume, mesh: trimesh.Trimesh) -> tuple[Volume, tuple[slice, slice, slice]]:
@@ -915,7 +924,7 @@ _STYLE: Any = {"font.size": 11.0, "axes.titlesize": 12.0, "figure.facecolor": "w
 # Told apart by those who do not tell red from green, and in grey.
 _COLOURS = ("#1b3a5c", "#e08214", "#4d9de0", "#7fb069", "#b5446e")
 _MARKS = ("o", "s", "^", "D", "v")
-_METHOD_COLOURS = {"consensus": "#1b3a5c", "hard": "#4d9de0", "soft": "#e08214"}
+_METHOD_COLOURS = dict(zip(METHODS, ("#1b3a5c", "#4d9de0", "#e08214", "#7fb069", "#b5446e"), strict=False))
 
 
 def _axes(width: float, height: float, title: str) -> tuple[Figure, Any]:

@@ -2,9 +2,9 @@
 
 Read this first. Steps of the paper, and what holds their equations: 3.1 `SubApertures.view_of_aspect`, 3.2
 `enhance`, 4.1 `segment_shadow`, 4.2 `likelihood.l_out`; carving, 4.1 and 4.2, `carving.Carver.integrate`, to
-which `Reconstruction.feed` leads; 4.2 threshold and surface, `threshold.occupied_voxels` and
-`mesh.mesh_from_grid`. `reference.py` has all of them literally. `run` strings them together; the node graph
-takes its views through the same properties and feeds the same `Reconstruction`.
+which `Reconstruction.feed` leads; 4.2 threshold, `threshold.object_threshold`; 4.1 surface,
+`mesh.mesh_from_grid`. `reference.py` has all but these two literally. `run` strings them together; the node
+graph takes its views through the same properties and feeds the same `Reconstruction`.
 """
 
 from __future__ import annotations

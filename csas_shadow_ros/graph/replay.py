@@ -593,7 +593,7 @@ def _node_plan(
     window: int,
     overrides: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, dict[str, Any]]:
-    plan: dict[str, dict[str, Any]] = {name: of_stage[name] for name in chain(stage)}
+    plan: dict[str, dict[str, Any]] = {name: of_stage.get(name, {}) for name in chain(stage)}
     if composites and joins("composites", stage):
         plan["composites"] = {}
     # Figure 8 compares the methods.
