@@ -662,7 +662,10 @@ def test_a_fork_server_that_is_killed_answers_also_if_what_it_forked_hangs(
         server.kill()
         with pytest.raises(ReplayError, match="the fork server has ended"):
             coming.result(timeout=30)
-        assert not members(group)
+        end = time.monotonic() + 30.0
+        while members(group):  # a killed process ends a moment later
+            assert time.monotonic() < end, members(group)
+            time.sleep(0.02)
 
 
 def members(group: int) -> list[int]:
