@@ -271,13 +271,13 @@ class TrackBook:
         named += f" and {len(spans) - 4} more" if len(spans) > 4 else ""
         tracks = "the track covers" if len(spans) == 1 else "the tracks cover"
         text = f"no track covers {what}: {tracks} {named}"
-        if stamp_ns is None or not spans:
+        if stamp_ns is None:
             return text
         # By which a clock of other units, or a track that ends early, is known.
         early = [(first - stamp_ns, "before the first pose") for first, _ in spans if stamp_ns < first]
         late = [(stamp_ns - last, "after the last pose") for _, last in spans if stamp_ns > last]
-        off, way = min(early + late)
-        return f"{text}; it lies {off / 1e9:.6g} s {way}"
+        off, way = min(early + late, default=(0, ""))
+        return f"{text}; it lies {off / 1e9:.6g} s {way}" if way else text
 
     def track(self, run_ns: int) -> Track:
         """Return all poses of a run; the same object until another piece arrives.
