@@ -202,6 +202,40 @@ def check_stamp(what: str, value: object) -> int:
     return check_whole(f"stamp (ns) of the {what}", value, 0, MAX_STAMP_NS, "ns")
 
 
+def check_divides_circle(
+    name: str, angle_deg: float, unit: str = " deg", *, off_deg: float = math.degrees(1e-6)
+) -> None:
+    """Refuse an angle of which no whole number makes a circle.
+
+    Parameters
+    ----------
+    name : str
+        What the angle is, for the message.
+    angle_deg : float
+        The angle, over 0.
+    unit : str
+        How the message writes degrees.
+    off_deg : float
+        The steps may miss 360° by so much.
+
+    Raises
+    ------
+    ParameterError
+        If the angle does not divide the circle.
+
+    Examples
+    --------
+    >>> check_divides_circle("step_deg", 5.0)
+    >>> check_divides_circle("step_deg", 7.0)
+    Traceback (most recent call last):
+        ...
+    csas_shadow_ros.core.errors.ParameterError: step_deg is 7 deg; expected a divisor of 360 deg (such as ...)
+    """
+    if abs(math.remainder(360.0, angle_deg)) > off_deg:
+        expected = f"expected a divisor of 360{unit} (such as 1, 5, 10)"
+        raise ParameterError(f"{name} is {angle_deg:g}{unit}; {expected}")
+
+
 def check_range(
     name: str, value: float, low: float, high: float, unit: str = "", *, open_low: bool = False
 ) -> float:

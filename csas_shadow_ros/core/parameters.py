@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 from .equality import equal_where_nan
-from .errors import ParameterError
+from .errors import ParameterError, check_divides_circle
 from .methods import METHODS, Method, method_named
 
 if TYPE_CHECKING:
@@ -189,10 +189,7 @@ class SubApertureParameters(Parameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if abs(math.remainder(360.0, self.step_deg)) > 5e-5:
-            raise ParameterError(
-                f"step_deg is {self.step_deg:g} deg; expected a divisor of 360 deg (such as 1, 2, 5)"
-            )
+        check_divides_circle("step_deg", self.step_deg)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from ..core.errors import ParameterError, check_range, check_type
+from ..core.errors import ParameterError, check_divides_circle, check_range, check_type
 from ..core.geometry import Acoustics, GroundGrid
 from ..core.parameters import Parameters, bounded
 
@@ -54,9 +54,7 @@ class Profile(Parameters):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("block_deg", "pose_step_deg"):
-            step = getattr(self, name)
-            if abs(round(360.0 / step) * step - 360.0) > 1e-6:
-                raise ParameterError(f"{name} is {step:g} deg; expected a divisor of 360 deg")
+            check_divides_circle(name, getattr(self, name), off_deg=1e-6)
         _, _, k_max = self.band_rad_m
         if k_max > math.pi / self.spacing_m:
             raise ParameterError(

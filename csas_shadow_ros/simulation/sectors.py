@@ -8,7 +8,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ..core.errors import ParameterError, TrackError, check_range
+from ..core.errors import ParameterError, TrackError, check_divides_circle, check_range
 from ..core.geometry import TWO_PI, CoherentImage, GroundGrid, GroundLattice, Track, unit_to_sonar
 from ..core.sectors.sector import Sector
 
@@ -49,9 +49,8 @@ def sectors_of_run(
     if lattice not in LATTICES:
         raise ParameterError(f"sector lattice is {lattice!r}; expected one of: {', '.join(LATTICES)}")
     check_range("sector width", width_deg, 0.0, 180.0, "deg", open_low=True)
+    check_divides_circle("sector width", width_deg, "°", off_deg=1e-6)
     count = round(360.0 / width_deg)
-    if abs(count * width_deg - 360.0) > 1e-6:
-        raise ParameterError(f"sector width is {width_deg:g}°; expected a divisor of 360° (such as 5 or 10)")
     rows, cols = image.grid.shape
     spectrum = scipy.fft.fft2(np.asarray(image.pixels, np.complex64), norm="forward", workers=-1)
     step_row, step_col = TWO_PI / (rows * image.grid.spacing_m), TWO_PI / (cols * image.grid.spacing_m)

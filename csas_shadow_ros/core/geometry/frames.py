@@ -10,7 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import GeometryError, ParameterError, check_finite, check_range, check_whole, quoted
+from ..errors import (
+    GeometryError,
+    ParameterError,
+    check_divides_circle,
+    check_finite,
+    check_range,
+    check_whole,
+    quoted,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -257,9 +265,6 @@ def aspects_of_step(step_rad: float, start_rad: float = 0.0) -> FloatArray:
         If the step does not divide the circle.
     """
     check_range("aspect step", step_rad, 0, TWO_PI, "rad", open_low=True)
+    check_divides_circle("aspect step", math.degrees(step_rad), "°")
     n = round(TWO_PI / step_rad)
-    if abs(n * step_rad - TWO_PI) > 1e-6:
-        raise ParameterError(
-            f"aspect step is {math.degrees(step_rad):g}°; expected a divisor of 360° (such as 1, 2, 5)"
-        )
     return start_rad + np.arange(n, dtype=np.float64) * (TWO_PI / n)
