@@ -354,6 +354,18 @@ def is_latched(name: str) -> bool:
     return rest in LATCHED and (not prefix or rest in PREFIXED_TOPICS)
 
 
+def is_result(name: str) -> bool:
+    """Say whether a topic (relative name) says what a run came to, again and again as that grows.
+
+    Examples
+    --------
+    >>> is_result("object_2/voxel_grid/image"), is_result("multilook/image"), is_result("shadow/image")
+    (True, True, False)
+    """
+    rest = split_prefix(name)[1]
+    return rest in RESULT_TOPICS or rest.partition("/")[0] in ("multilook", "color_by_aspect")
+
+
 def stream(name: str) -> ImageStream:
     """Return the image stream of that name, with or without a prefix (``object_2/voxel_grid``).
 

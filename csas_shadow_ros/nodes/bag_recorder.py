@@ -11,6 +11,7 @@ import zlib
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -19,7 +20,7 @@ from csas_shadow_ros.core.errors import BagError, ParameterError
 from csas_shadow_ros.core.geometry.runs import TrackBook
 from csas_shadow_ros.durable import sync_tree
 from msg_adapters import STREAMS, TOPICS, message_from_cdr, track_piece_from_msg
-from msg_adapters.topics import absolute_name, is_latched, is_topic, split_prefix
+from msg_adapters.topics import absolute_name, is_latched, is_result, is_topic, split_prefix
 from msg_adapters.topics import topic as topic_of
 
 from . import qos
@@ -97,6 +98,8 @@ class RunBag:
     seen: set[tuple[str, int, int]] = field(default_factory=set)
     #: Latched topics that it has messages of.
     latched: set[str] = field(default_factory=set)
+    #: It has messages of views.
+    has_views: bool = False
 
 
 class BagRecorderNode(CsasNode):
@@ -237,13 +240,14 @@ class BagRecorderNode(CsasNode):
                 self._tracks.setdefault(after, []).extend(self._tracks.pop(before))
         return name
 
-    def _place_again(self, patience_s: float = HOLD_S) -> None:
+    def _place_again(self, *, at_once: bool = False) -> None:
         """Write what waits for its track, as far as it has come, or it has waited long enough."""
         held, self._unplaced = self._unplaced, []
         for since_s, topic, cdr in held:
-            late = time.monotonic() - since_s > patience_s
+            late = at_once or time.monotonic() - since_s > HOLD_S
             if late or self._book.run_of(message_stamp(cdr, topic) or 0) is not None:
-                self._take(topic, cdr, late=late)
+                # One that is refused is not to cost those behind it.
+                self.guard(topic, partial(self._take, late=late), topic, cdr)
             else:
                 self._unplaced.append((since_s, topic, cdr))
 
@@ -282,10 +286,11 @@ class BagRecorderNode(CsasNode):
         """Write what has a stamp into the bag of its run, which it may begin."""
         stamp = None if topic in _NEVER_ALIKE else message_stamp(cdr, topic)
         run_ns = None if stamp is None else self._book.run_of(stamp)
-        if run_ns is None and stamp is not None and self._book.names and not late:
-            # It may have overtaken its track, as views do that reach a recorder which has just begun again.
-            self._wait_for_track(topic, cdr)
-            return
+        if run_ns is None and stamp is not None:
+            if not late and self._may_have_overtaken_its_track(topic):
+                self._wait_for_track(topic, cdr)
+                return
+            self._require_of_known_run(topic, stamp)
         if run_ns in self._over:
             raise BagError(f"{topic} of the run of {run_ns} ns came after its bag was finished; not recorded")
         for bag in self._bags:
@@ -300,6 +305,25 @@ class BagRecorderNode(CsasNode):
         if topic in _ENDS_THE_RUN_BEFORE:
             for older in self._bags[: self._bags.index(bag)]:
                 self._close_bag(older)
+
+    def _may_have_overtaken_its_track(self, topic: str) -> bool:
+        """Say whether a message that no track covers may be of a run whose track is still to come.
+
+        Views do so that reach a recorder which has just begun again, and the result of an earlier run that
+        is still published when a recorder begins. Where views came without a track, none is to come.
+        """
+        if self._book.names:
+            return True
+        return is_result(topic) and "track" in self._recorded and not self._bags[-1].has_views
+
+    def _require_of_known_run(self, topic: str, stamp: int) -> None:
+        """Raise for the result of a run that was over before this recorder began: no bag here is its."""
+        first = min(self._book.names, default=0)
+        if is_result(topic) and stamp < first:
+            raise BagError(
+                f"{topic} stamped {stamp} ns is of a run before the first whose track came ({first} ns);"
+                " not recorded"
+            )
 
     def _wait_for_track(self, topic: str, cdr: bytes) -> None:
         """Keep a message until its track comes; if there are too many, the oldest view goes."""
@@ -395,6 +419,7 @@ class BagRecorderNode(CsasNode):
                 bag.seen.add(key)
         if flow is not None and stamp is not None:
             inlet, is_info = flow
+            bag.has_views = True
             if report:
                 self.counts["in"] += not is_info
                 if stamp in inlet.stamps[not is_info]:
@@ -451,7 +476,7 @@ class BagRecorderNode(CsasNode):
     def finish(self) -> None:
         """Finish the bags, with their metadata last."""
         if self._bags:
-            self._place_again(0.0)
+            self._place_again(at_once=True)
         for bag in list(self._bags):
             self._close_bag(bag)
         if self._lock is not None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters import view_from_msgs
-from msg_adapters.topics import RESULT_TOPICS, split_prefix, stream
+from msg_adapters.topics import is_result, stream
 
 from ..bags import BagReader
 from ..bags.index import BagIndex
@@ -132,16 +132,10 @@ def unplaced(replayed: ReplayResult) -> list[str]:
     ]
 
 
-def is_snapshot(reader: BagReader, name: str) -> bool:
-    """Say whether a recorded topic is a result that was published again and again as it grew."""
-    relative = split_prefix(name.removeprefix(f"{reader.namespace}/"))[1]
-    return relative in RESULT_TOPICS or relative.partition("/")[0] in ("multilook", "color_by_aspect")
-
-
 def copy_recording(recording: Path, target: Any) -> None:
     """Copy a recording into a bag writer as it is; of results that grew, only the last."""
     reader = BagReader(recording)
     for message in reader.messages():
         last = message.number == reader.topics[message.topic].count - 1
-        if last or not is_snapshot(reader, message.topic):
+        if last or not is_result(message.topic.removeprefix(f"{reader.namespace}/")):
             target.write(message.topic, message.cdr, message.log_time_ns, type_name=message.type_name)

@@ -13,13 +13,14 @@ pytest.importorskip("rclpy")
 
 from graph_of_nodes import PARAMETERS, STEP_DEG, VOXEL_M, Graph
 
-from csas_shadow_ros.bags import read_run
+from csas_shadow_ros.bags import BagReader, read_run
 from csas_shadow_ros.core.geometry import Track
 from csas_shadow_ros.core.imaging.subaperture import SubApertures
 from csas_shadow_ros.core.pipeline import Result, run
 from csas_shadow_ros.nodes import qos
 from csas_shadow_ros.nodes.bag_recorder import BagRecorderNode
 from csas_shadow_ros.nodes.composites import CompositesNode
+from csas_shadow_ros.nodes.playing import header_stamp
 from csas_shadow_ros.nodes.shadow_enhancement import ShadowEnhancementNode
 from csas_shadow_ros.nodes.shadow_likelihood import ShadowLikelihoodNode
 from csas_shadow_ros.nodes.sub_aperture import SubApertureNode
@@ -36,6 +37,7 @@ from msg_adapters import (
     track_to_msg,
     view_to_msgs,
     voxel_grid_from_msgs,
+    voxel_grid_to_msgs,
 )
 
 #: Seconds between the circles of two contacts: more than one takes.
@@ -264,6 +266,53 @@ def test_a_view_that_comes_before_its_track_is_recorded_into_its_own_run_s_bag(
         bag = read_run(path)
         assert bag.counts["sub_aperture"] == 1
         assert [one.info.stamp_ns for one in bag.views("sub_aperture")] == [view.info.stamp_ns]
+
+
+@pytest.mark.parametrize("track_first", [True, False])
+def test_a_recorder_that_begins_late_leaves_the_result_of_the_run_before_out_of_its_bag(
+    graph: Graph,
+    contacts: list[SimulatedRun],
+    alone: list[Result],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    track_first: bool,
+) -> None:
+    """The last result stays published: whoever begins in the next run hears it, without its track."""
+    monkeypatch.setattr("csas_shadow_ros.nodes.bag_recorder.HOLD_S", 0.5)
+    node = graph.plain_node("vehicle")
+    names = ("voxel_grid/image", "voxel_grid/camera_info", "track")
+    publishers = {
+        name: node.create_publisher(MESSAGES.cls(topic(name).type_name), name, qos.LATCHED) for name in names
+    }
+
+    def send_result(number: int) -> None:
+        stamp = contacts[number].image.stamp_ns
+        grid = alone[number].grid
+        assert grid is not None
+        image, info = voxel_grid_to_msgs(MESSAGES, grid.volume, grid.likelihood, stamp)
+        publishers["voxel_grid/image"].publish(image)
+        publishers["voxel_grid/camera_info"].publish(info)
+
+    def send_track(number: int) -> None:
+        publishers["track"].publish(track_to_msg(MESSAGES, contacts[number].track))
+
+    send_result(0)
+    if track_first:
+        send_track(1)
+    recorder = graph.add(BagRecorderNode, out=str(tmp_path / "late"), topics=",".join(names))
+    if not track_first:
+        graph.spin_until(lambda: recorder.state_counts()["waiting_for_track"] == 2, what="both wait")
+        send_track(1)
+    graph.spin_until(lambda: recorder.counts["written"] >= 1, what="the track")
+    graph.spin_until(
+        lambda: any("of a run before" in text for text in recorder.examples.values()), what="refusal"
+    )
+    send_result(1)
+    graph.spin_until(lambda: recorder.counts["written"] == 3, what="its own result")
+    recorder.stop()
+    with BagReader(tmp_path / "late") as bag:
+        stamps = {header_stamp(m.cdr, m.topic) for m in bag.messages() if "voxel_grid" in m.topic}
+    assert stamps == {contacts[1].image.stamp_ns}
 
 
 @pytest.mark.parametrize("image_first", [True, False])
