@@ -198,6 +198,17 @@ def family_table(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
+def quality_table(rows: Sequence[Row]) -> list[str]:
+    """Write a line for each quality verdict, of the bodies that were found where it is required."""
+    found = [(r, b) for r, b in bodies_of(rows, asked=True) if b.found]
+    lines = [_GROUP_HEAD[0].replace("| |", "| quality |", 1), _GROUP_HEAD[1]]
+    for quality in ("good", "limited", "not trustworthy"):
+        own = [p for p in found if p[0].quality == quality]
+        if own:
+            lines.append(_group_row(quality, own))
+    return lines
+
+
 def complication_table(rows: Sequence[Row]) -> list[str]:
     """Write a line for each complication of scenes with objects."""
     lines = [_GROUP_HEAD[0].replace("| |", "| scenes with |", 1), _GROUP_HEAD[1]]
@@ -281,13 +292,13 @@ def page(rows: Sequence[Row], half: str, figures: Mapping[str, str]) -> str:
     kinds = "; ".join(f"{name} ({f.text})" for name, f in FAMILIES[half].items())
     shares = ", ".join(f"{n}: {_percent(s)}" for n, s in enumerate(COMPLICATION_SHARES))
     lines = [
-        "# Accuracy",
+        "# Accuracy on random scenes",
         "",
         "Results of the chain, fully automatic and with default parameters, on scenes drawn at random."
         " Written by:",
         "",
         f"    python benchmarks/population.py --half {half} --scenes {len(rows)} --out FOLDER",
-        f"    python benchmarks/population.py --half {half} --out FOLDER --page docs/accuracy.md",
+        f"    python benchmarks/population.py --half {half} --out FOLDER --page docs/population.md",
         "",
         f"{sum(bool(r.bodies) for r in rows)} scenes with objects, {sum(not r.bodies for r in rows)} without,"
         f" of the {half} half (code {', '.join(codes) or 'unknown'}).",
@@ -305,6 +316,8 @@ def page(rows: Sequence[Row], half: str, figures: Mapping[str, str]) -> str:
         "",
     ]
     lines += [f"![{text}]({path})\n" for path, text in figures.items() if "scene" not in Path(path).stem]
+    lines += ["## By verdict", "", "Bodies that were found, where it is required*.", ""]
+    lines += [*quality_table(rows), ""]
     lines += ["## By family", "", *family_table(rows), ""]
     lines += ["## By what else there is", "", *complication_table(rows), "", *seabed_table(rows), ""]
     lines += ["## The worst ten", "", "By IoU of the main body with its hull.", "", *worst_table(rows), ""]

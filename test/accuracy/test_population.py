@@ -27,10 +27,11 @@ def population():
     sys.path.insert(0, str(BENCHMARKS))
     try:
         modules = {name: importlib.import_module(name) for name in names}
+        losses = importlib.import_module("population_losses")
     finally:
         sys.path.remove(str(BENCHMARKS))
     public = {k: v for m in modules.values() for k, v in vars(m).items() if not k.startswith("_")}
-    return SimpleNamespace(**public, pages=modules["population_page"])
+    return SimpleNamespace(**public, pages=modules["population_page"], losses=losses)
 
 
 @pytest.fixture(scope="module")
@@ -287,6 +288,20 @@ def test_a_scene_is_wrong_where_an_extent_is_off_by_more_than_interval_and_toler
     assert wrong(1.10, 0.05)
 
 
+def test_each_verdict_has_a_line_of_the_bodies_that_it_was_given(population):
+    good = [row_of(population, i, bodies=(body_of(population),)) for i in range(3)]
+    limited = row_of(
+        population, 3, bodies=(body_of(population, 1.2, 0.02, iou=0.5),), quality="limited"
+    )
+    missed = row_of(
+        population, 4, bodies=(body_of(population, found=False, iou=0.0, size={}, intervals={}),)
+    )
+    told = population.pages.quality_table([*good, limited, missed])[2:]
+    assert [line.split(" | ")[:2] for line in told] == [["| good", "3"], ["| limited", "1"]]
+    assert "| 100 % | 100 % |" in told[0]
+    assert "0.50 / 0.50" in told[1]
+
+
 def test_what_is_asked_is_met_and_not_met_as_the_rows_say(population):
     def verdicts(rows):
         return [line.met for line in population.pages.acceptance(rows)]
@@ -329,3 +344,16 @@ def test_a_scene_runs_is_written_down_and_is_not_run_again(population, tmp_path)
     for picture in ("population_distributions", "population_dependence", "population_scene_01"):
         assert f"figures/{picture}.png" in text
         assert (page.parent / "figures" / f"{picture}.png").stat().st_size > 1000
+
+
+def test_true_shadows_lose_less_than_segmented_ones_and_least_without_echoes(population, capsys):
+    index = 8  # a sphere, whose undercut lies under its own echo
+    told = population.losses.losses_of(index)
+    assert told.family == "sphere"
+    assert told.found < told.true_shadows < told.no_echoes
+    assert told.no_echoes > 0.95
+    assert population.losses.losses_of(1) is None  # of several bodies
+    assert population.losses.main(["--only", "1", str(index), "--workers", "1"]) == 0
+    table = capsys.readouterr().out.splitlines()
+    assert table[2].startswith(f"| sphere | 1 | {told.found:.2f} | {told.true_shadows:.2f} |")
+    assert table[-1].startswith("| **tenth percentile** | 1 |")
