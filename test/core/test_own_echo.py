@@ -9,7 +9,7 @@ import pytest
 from core_data import hidden_by_box, iou, make_info, perfect_views
 
 from csas_shadow_ros.core.geometry import View
-from csas_shadow_ros.core.imaging.mask_codes import MASK_SHADOW
+from csas_shadow_ros.core.imaging.mask_codes import MASK_OUTSIDE, MASK_SHADOW
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.pipeline import run
 from csas_shadow_ros.core.shape.carving import Carver, carve
@@ -176,6 +176,26 @@ def test_sides_beyond_the_volume_are_not_the_bodys_and_bound_no_plan():
 
     assert plan(0.2) is not None
     assert plan(0.6) is None
+
+
+@pytest.mark.parametrize(("share", "comes_back"), [(0.5, True), (1.0, False)])
+def test_a_plan_that_is_lit_from_everywhere_is_seabed_and_one_lit_from_half_of_it_a_body(share, comes_back):
+    """As between the blocks of a laying grid, whose shadows a slab of the grid's size would explain best."""
+    low = perfect_views(lambda x, y, s: hidden_by_box(x, y, s, LOW, (*HIGH[:2], 0.15)), INFOS, "mask")
+    carver = Carver(VOLUME, CarvingParameters())
+    for number, mask in enumerate(low):
+        pixels = mask.pixels.copy()
+        if number % 10 < share * 10:
+            u, v = np.meshgrid(np.arange(pixels.shape[1]), np.arange(pixels.shape[0]))
+            ground = np.stack([u, v, np.ones_like(u)], axis=-1) @ mask.info.camera.pixel_to_ground.T
+            pixels[(np.abs(ground[..., 0]) < HIGH[0]) & (np.abs(ground[..., 1]) < HIGH[1])] = MASK_OUTSIDE
+        carver.integrate(View(mask.info, pixels))
+    body = carver.grid()
+    whole = carver.given_back(body)
+    if comes_back:
+        assert whole.occupied.sum() > 5 * body.occupied.sum()
+    else:
+        assert whole is body
 
 
 def test_columns_stand_on_a_plan():
