@@ -24,12 +24,15 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import cv2
 from accuracy import code_fingerprint
 from population_page import family_table, publish, seabed_table, tables
 from population_scenes import DEVELOPMENT, DRAWING, HALVES, TEST
 from population_scores import Row, score_scene
+
+Result = TypeVar("Result")
 
 #: What of the benchmark decides its numbers.
 _OWN = ("population_scenes.py", "population_scores.py")
@@ -73,17 +76,30 @@ def _one_thread() -> None:
     cv2.setNumThreads(1)
 
 
-def _score_all(half: str, todo: Sequence[int], shapes: Path, workers: int) -> Iterator[Row]:
+def in_processes(
+    work: Callable[..., Result], calls: Sequence[tuple[Any, ...]], workers: int
+) -> Iterator[Result]:
+    """Yield what a function returns for each tuple of arguments, as soon as it does.
+
+    Parameters
+    ----------
+    work : callable
+        A function of a module.
+    calls : sequence of tuple
+        Arguments of each call.
+    workers : int
+        Processes with one thread each; 1: this one.
+    """
     if workers == 1:
-        for index in todo:
-            yield score_scene(half, index, shapes)
+        for arguments in calls:
+            yield work(*arguments)
         return
     # The variables are read when the libraries are loaded: they are for the processes that start now.
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread)
     try:
-        for future in as_completed([pool.submit(score_scene, half, index, shapes) for index in todo]):
+        for future in as_completed([pool.submit(work, *arguments) for arguments in calls]):
             yield future.result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
@@ -125,7 +141,8 @@ def run_scenes(
     with record.open("a", encoding="utf-8") as file:
         if record.stat().st_size and not record.read_bytes().endswith(b"\n"):
             file.write("\n")  # a line that was cut short stays alone
-        for row in _score_all(half, todo, out / "shapes", workers) if todo else ():
+        calls = [(half, index, out / "shapes") for index in todo]
+        for row in in_processes(score_scene, calls, workers) if todo else ():
             row = replace(row, code=code)
             rows[row.index] = row
             file.write(json.dumps({**asdict(row), "drawing": DRAWING}) + "\n")

@@ -5,33 +5,31 @@ views and geometry, with what is true instead of what was segmented::
 
     python benchmarks/population_losses.py --scenes 120 --workers 2
 
-Its four columns of IoU with the shadow hull:
+Its columns of IoU with the shadow hull:
 
 - *found*: the result, as the chain leaves it.
 - *true shadows*: each silhouette is the true one, but what the view's echoes hide or may cover stays as the
   chain marked it. What is lost from here to *found* is segmentation's.
 - *no echoes*: each silhouette is the true one, and echoes hide nothing. What is lost from here to *true
   shadows* is what echoes leave open.
-- what *no echoes* lacks to 1 is lost in carving: to pixels, voxels and the share of views that removes a
-  voxel.
 
-Scenes with one body, a contrast of 6 dB or more and shadows in the image take part, where the search found
-the body whole.
+What *no echoes* lacks to 1 is lost in carving: to pixels, voxels and the share of views that removes a voxel.
+
+Scenes with one body, a contrast of 6 dB or more and shadows in the image take part, where some of the body
+was found.
 """
 
 from __future__ import annotations
 
 import argparse
-import multiprocessing
-import os
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from population import in_processes
 from population_scenes import DEVELOPMENT, draw
 from population_scores import LEAST_CONTRAST_DB, TrueBody
 
@@ -42,10 +40,10 @@ from csas_shadow_ros.core.pipeline import ProcessedView, run
 from csas_shadow_ros.core.shape.carving import carve
 from csas_shadow_ros.core.shape.explained import cast_shadow
 from csas_shadow_ros.core.shape.volume import VoxelGrid
+from csas_shadow_ros.simulation import iou
 
 #: The true shadow is cast from voxels so many times finer than those carved.
 _FINER = 3
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -112,17 +110,7 @@ def _silhouette(shadow: NDArray[np.bool_]) -> NDArray[np.uint8]:
 
 def _iou(body: TrueBody, grid: VoxelGrid) -> float:
     occupied, hull, _ = body.compared(grid)
-    return float((occupied & hull).sum() / max(1, (occupied | hull).sum()))
-
-
-def _all(indices: Sequence[int], workers: int) -> Iterator[Losses | None]:
-    if workers == 1:
-        yield from map(losses_of, indices)
-        return
-    # The variables are read when the libraries are loaded: they are for the processes that start now.
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        yield from pool.map(losses_of, indices)
+    return iou(occupied, hull)
 
 
 def table(rows: Sequence[Losses]) -> list[str]:
@@ -152,9 +140,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     indices = options.only or range(options.scenes)
     rows = []
-    for done, (index, row) in enumerate(zip(indices, _all(indices, options.workers), strict=True), start=1):
-        told = "does not take part" if row is None else f"{row.family}: IoU {row.found:.2f}"
-        print(f"{done}/{len(indices)} scene {index} {told}", file=sys.stderr, flush=True)
+    calls = [(index,) for index in indices]
+    for done, row in enumerate(in_processes(losses_of, calls, options.workers), start=1):
+        told = "takes no part" if row is None else f"scene {row.index} {row.family}: IoU {row.found:.2f}"
+        print(f"{done}/{len(indices)} {told}", file=sys.stderr, flush=True)
         rows += [] if row is None else [row]
     if not rows:
         parser.error("none of these scenes takes part; expected more of them")

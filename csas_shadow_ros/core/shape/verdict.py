@@ -23,8 +23,8 @@ _WHOLE_ARC = 0.75
 _MOST_REJECTED = 0.1
 #: Segmented shadow that what was found does not cast (share, mean over the views), above which a result is
 #: limited, and above which it is not to be trusted. Five simulated boxes and a ramp left 0.2 to 2.5 % (8 to
-#: 15 dB), one of two bodies whose shadows touch 45 %, a measured vehicle 20 %. Chosen on these few:
-#: `benchmarks/population.py` has not judged them yet.
+#: 15 dB), one of two bodies whose shadows touch 45 %, a measured vehicle 20 %. Chosen on these few.
+#: What the verdicts are worth on scenes that chose nothing: docs/population.md, "By verdict".
 _UNEXPLAINED, _MOST_UNEXPLAINED = 0.1, 0.25
 #: Likewise of the shadow that it casts and that is lit in the views: 0 to 0.2 % for the same shapes.
 #: The limits are reasoned, not measured.
