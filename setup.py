@@ -40,8 +40,6 @@ CORE = [
 ROS = ["ros-rclpy==7.1.6", "ros-rmw-fastrtps-cpp==8.4.3", "ros-common-interfaces==5.3.6"]
 # pytest 8 does not start beside Jazzy's launch_testing: Ubuntu 24.04 has 7.4.4.
 TEST = ["pytest>=7.4.4", "pytest-xdist>=3.4", "hypothesis>=6.98", "ruff~=0.17.6", "mypy~=2.4.1"]
-# A test that hangs fails, and the others are run.
-TEST += ["pytest-timeout>=2.2"]
 # What scene metres to latitude and longitude are compared with.
 TEST += ["pyproj>=3.6"]
 TEST += ["packaging>=23"]

@@ -365,7 +365,6 @@ def test_a_replay_without_a_stage_carves_what_ones_own_makes_in_its_place(
     assert made.dimensions is not None
 
 
-@pytest.mark.timeout(120)
 def test_a_replay_that_lacks_ones_own_stage_says_so_and_ends(run_bag: Path, tmp_path: Path) -> None:
     told: list[str] = []
 
@@ -465,7 +464,7 @@ def test_a_node_that_waits_names_a_process_whose_port_another_has_replaced(
             ports = {name for name in owned_files(process.pid) if "_port" in name}
             for port in ports:
                 Path(port).unlink()
-                Path(port).write_bytes(bytes(4096))
+                Path(port).write_bytes(b"made")  # by an unmade one any other test would be held up
             graph.spin_until(lambda: f"process {process.pid} (" in told[-1])
             assert told[-1].endswith("in shared memory that it reads; start it again")
         finally:

@@ -44,6 +44,7 @@ from csas_shadow_ros.nodes.runtime import hearing
 from csas_shadow_ros.nodes.runtime.shared_memory import (
     owned_files,
     ports_of,
+    remove_ports,
     remove_unmade_ports,
     segments_of,
 )
@@ -747,6 +748,16 @@ def test_a_port_that_its_killed_maker_left_unmade_holds_nobody_up(
                 time.sleep(0.05)
     finally:
         fresh.unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("size", [0, 206_000], ids=["without a length", "without contents"])
+def test_who_waits_for_an_unmade_port_goes_on_once_its_domain_is_tidied(domain: int, size: int) -> None:
+    unmade = Path(f"/dev/shm/fastrtps_port{ports_of(domain)[11]}")
+    unmade.write_bytes(bytes(size))
+    with unmade.open("rb") as waiting:
+        remove_ports(domain)
+        assert not unmade.exists()
+        assert waiting.read(4) == (3).to_bytes(4, sys.byteorder), "Boost gives it up as corrupt"
 
 
 @pytest.mark.parametrize("size", [0, 206_000], ids=["without a length", "without contents"])

@@ -107,6 +107,7 @@ def remove_ports(domain_id: int) -> None:
             if owner.exists():
                 remove_segment(port)  # not one whose owner lives
             if not owner.exists():
+                _remove_if_unmade(port)  # whoever waits for it would never see its end
                 port.unlink(missing_ok=True)
                 port.with_name(f"sem.{port.name}_mutex").unlink(missing_ok=True)
 
@@ -118,16 +119,19 @@ def remove_unmade_ports() -> list[Path]:
     gives it its length, begins it with 0 or 1 until it is made, then with 2. At 3 whoever waits goes on, and
     makes it anew.
     """
-    removed = []
-    for port in Path(_SEGMENTS).parent.glob(f"{Path(_SEGMENTS).name}port*[0-9]"):
-        with contextlib.suppress(OSError), port.open("r+b") as file:
-            old = time.time() - os.fstat(file.fileno()).st_mtime > LOCKED_S
-            if old and file.read(4) in (_EMPTY, _UNMADE, _IN_MAKING):
-                port.unlink()
-                file.seek(0)
-                file.write(_CORRUPT)
-                removed.append(port)
-    return removed
+    ports = Path(_SEGMENTS).parent.glob(f"{Path(_SEGMENTS).name}port*[0-9]")
+    return [port for port in ports if _remove_if_unmade(port, LOCKED_S)]
+
+
+def _remove_if_unmade(port: Path, least_age_s: float = 0.0) -> bool:
+    with contextlib.suppress(OSError), port.open("r+b") as file:
+        old = time.time() - os.fstat(file.fileno()).st_mtime > least_age_s
+        if old and file.read(4) in (_EMPTY, _UNMADE, _IN_MAKING):
+            port.unlink()
+            file.seek(0)
+            file.write(_CORRUPT)
+            return True
+    return False
 
 
 def tidy_up_after_a_killed_graph(domain_id: int, since_s: float) -> None:
