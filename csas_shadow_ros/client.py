@@ -44,7 +44,7 @@ from msg_adapters.topics import stream as stream_of
 from msg_adapters.topics import topic as topic_of
 
 from .nodes import qos
-from .nodes.runtime.base import BEAT_S, Inlet, ViewOutlet
+from .nodes.runtime.base import BEAT_S, Inlet, ViewOutlet, say_goodbye
 from .nodes.runtime.flow import place_of
 from .nodes.runtime.hearing import Reach, avoid_dead_ports
 from .nodes.runtime.pace import Growing, source_is_there
@@ -476,7 +476,7 @@ class _Host:
 
     def leave(self, inlet: Inlet) -> None:
         self.inlets.remove(inlet)
-        self._heartbeats.publish(progress_to_msg(self.messages, inlet.beat(leaving=True)))
+        say_goodbye(self._heartbeats, self.messages, [inlet])
 
     def reject(self, reason: str) -> None:
         self.counts["rejected"] += 1

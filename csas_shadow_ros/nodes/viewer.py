@@ -19,8 +19,6 @@ from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
-from rclpy.duration import Duration
-
 from csas_shadow_ros.bags.bag import BagMessage
 from csas_shadow_ros.core.errors import CsasError
 from csas_shadow_ros.core.parameters import CarvingParameters, SubApertureParameters
@@ -39,7 +37,6 @@ from msg_adapters import (
     coherent_image_from_msgs,
     ground_picture_from_msgs,
     measurements_from_msg,
-    progress_to_msg,
     target_from_msg,
     view_from_msgs,
     voxel_grid_from_msgs,
@@ -47,7 +44,7 @@ from msg_adapters import (
 from msg_adapters.topics import stream as stream_of
 
 from . import qos
-from .runtime.base import INTEGRATED, CsasNode, Inlet, run_node
+from .runtime.base import INTEGRATED, CsasNode, Inlet, run_node, say_goodbye
 from .runtime.flow import place_of
 from .runtime.runs import RunFollower
 
@@ -346,9 +343,7 @@ class ViewerNode(CsasNode):
     def _leave(self) -> None:
         """Say goodbye and take the kept reports back: a later source would wait for their sender."""
         with self._beat_lock:
-            for inlet in self.inlets:
-                self._heartbeats.publish(progress_to_msg(self.messages, inlet.beat(leaving=True)))
-                self._heartbeats.wait_for_all_acked(Duration(seconds=0.2))
+            say_goodbye(self._heartbeats, self.messages, self.inlets)
             self.inlets.clear()
             old = (self._reports, self._heartbeats)
             self._owned = [(destroy, made) for destroy, made in self._owned if made not in old]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -291,6 +293,17 @@ STAGE = """
     with ViewSubscriber(node, "shadow", classify, results=sys.argv[1]):
         spin(node)
 """
+
+
+def test_a_goodbye_is_heard_by_a_node_that_has_no_processor_just_then(live: Callable[..., Live]) -> None:
+    graph = live(sub_aperture={"min_sinks": 3, "sink_wait_s": 86400.0})
+    outside = graph.start(EXAMPLE, 0.2)
+    graph.until(outside.got(10), "it is mid-run")
+    busy = graph.graph.processes["sub_aperture"].pid
+    os.kill(busy, signal.SIGSTOP)
+    threading.Timer(0.6, os.kill, (busy, signal.SIGCONT)).start()
+    outside.end()
+    graph.until(lambda: graph.carved() == VIEWS, "the run ends without it")
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,8 @@ NAMESPACE = "csas"
 BEAT_S = 0.5
 _LOG_EVERY_S = 10.0
 _MAX_KINDS = 32
+#: Who leaves waits so long (s) for others to hear of it. One that is killed never does.
+_GOODBYE_S = 2.0
 #: So many views are known again if they come twice: as many as the kept reports (`qos.REPORTS`).
 _REMEMBERED = 4096
 _LONELY_S = 5.0
@@ -440,13 +442,14 @@ class CsasNode(LifecycleNode):
         """Say goodbye for one inlet."""
         with self._beat_lock:
             self.inlets.remove(inlet)
-            self._heartbeats.publish(progress_to_msg(self.messages, inlet.beat(leaving=True)))
+            say_goodbye(self._heartbeats, self.messages, [inlet])
 
-    def _send_beats(self, *, leaving: bool = False) -> None:
-        voices: list[Inlet | Source] = [*self.inlets, *self.sources]
-        for voice in voices:
-            beat = voice.beat(leaving=leaving)
-            self._heartbeats.publish(progress_to_msg(self.messages, beat))
+    def _send_beats(self) -> None:
+        for voice in self._voices():
+            self._heartbeats.publish(progress_to_msg(self.messages, voice.beat(leaving=False)))
+
+    def _voices(self) -> list[Inlet | Source]:
+        return [*self.inlets, *self.sources]
 
     def common_counts(self) -> dict[str, int]:
         """Return the counts that every heartbeat carries."""
@@ -576,7 +579,7 @@ class CsasNode(LifecycleNode):
         with self._beat_lock:
             self.active = False
             try:
-                self._send_beats(leaving=True)
+                say_goodbye(self._heartbeats, self.messages, self._voices())
             except (InvalidHandle, RuntimeError) as error:
                 self.get_logger().debug(f"could not say goodbye: {error}")
         if self._beat_thread is not None:
@@ -1135,6 +1138,20 @@ class Source:
             values["error"] = self.node.trouble
         counts = self.node.common_counts() | self.counts()
         return Heartbeat(self.node.now_ns(), self.node.name, self.instance, "source", counts, values)
+
+
+def say_goodbye(heartbeats: Publisher, messages: RclpyMessages, voices: Sequence[Inlet | Source]) -> None:
+    """Publish last heartbeats one by one, and wait for each until all others have it, two seconds in all.
+
+    What others have not acknowledged goes with its publisher, which is destroyed next. Who has no processor
+    just then would wait for the sender as for one that was killed.
+    """
+    end_s = time.monotonic() + _GOODBYE_S
+    for voice in voices:
+        heartbeats.publish(progress_to_msg(messages, voice.beat(leaving=True)))
+        left_s = end_s - time.monotonic()
+        if left_s > 0.0:
+            heartbeats.wait_for_all_acked(Duration(seconds=left_s))
 
 
 class ViewOutlet:
