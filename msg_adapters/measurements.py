@@ -13,7 +13,15 @@ from csas_shadow_ros.core.errors import AdapterError, CsasError, quoted
 from csas_shadow_ros.core.geometry import SCENE_FRAME, Datum, Place
 from csas_shadow_ros.core.methods import METHODS
 from csas_shadow_ros.core.shape.mesh import Dimensions
-from csas_shadow_ros.core.shape.result import QUALITIES, VERDICTS, LeftOut, ObjectResult, Quality, Result
+from csas_shadow_ros.core.shape.result import (
+    QUALITIES,
+    VERDICTS,
+    Detectable,
+    LeftOut,
+    ObjectResult,
+    Quality,
+    Result,
+)
 from csas_shadow_ros.core.shape.seabed import SeabedSlope
 from csas_shadow_ros.core.shape.volume import Target, VoxelGrid
 
@@ -23,6 +31,8 @@ from .statuses import (
     RUN,
     Status,
     Value,
+    detectable_of,
+    detectable_values,
     left_out_of,
     left_out_statuses,
     numbered,
@@ -123,7 +133,7 @@ class Measurements:
         Stamp of the message, ns.
     newest_ns : int
         Stamp of the newest view in it.
-    run_ns, final, verdict, quality, arc_rad, views_used, target, sign
+    run_ns, final, verdict, quality, arc_rad, views_used, target, sign, detectable
         See `Result`.
     objects : tuple of MeasuredObject
         By rising number.
@@ -147,6 +157,7 @@ class Measurements:
     views_used: int
     target: Target | None = None
     sign: SignEvidence | None = None
+    detectable: Detectable | None = None
     objects: tuple[MeasuredObject, ...] = ()
     grid: GridFacts | None = None
     other_grid: GridFacts | None = None
@@ -278,7 +289,7 @@ def _run_values(result: Result) -> dict[str, Value]:
         "arc_rad": result.arc_rad,
         "views": int(result.views_used),
     }
-    values |= sign_values(result.sign) | _datum_values(result.datum)
+    values |= sign_values(result.sign) | detectable_values(result.detectable) | _datum_values(result.datum)
     if result.target is not None:
         values |= target_values(result.target, _TARGET)
     if result.grid is not None:
@@ -358,6 +369,7 @@ def measurements_from_msg(msg: Any) -> Measurements:
         views_used=run.whole("views"),
         target=target_of(run, _TARGET) if f"{_TARGET}x_m" in run else None,
         sign=sign_of(run),
+        detectable=detectable_of(run),
         objects=tuple(_object_of(number, one) for number, one in numbered(statuses, _OBJECT).items()),
         grid=_grid_of(run) if "voxel_size_m" in run else None,
         other_grid=_grid_of(statuses[_OTHER]) if _OTHER in statuses else None,

@@ -194,6 +194,7 @@ def result_from_msgs(messages: Mapping[str, Any]) -> Result:
         quality=told.quality,
         target=told.target,
         sign=told.sign,
+        detectable=told.detectable,
         views_used=told.views_used,
         arc_rad=told.arc_rad,
         evidence=evidence_from_msg(reader.stamped("evidence")),

@@ -10,6 +10,8 @@ from .statuses import (
     RUN,
     Status,
     Value,
+    detectable_of,
+    detectable_values,
     left_out_of,
     left_out_statuses,
     numbered,
@@ -82,6 +84,7 @@ def decision_to_msg(
     """
     values: dict[str, Value] = {} if run_ns is None else {"run": int(run_ns)}
     values |= {"target": int(target_stamp_ns), "may_move": bool(may_move)} | sign_values(decision.sign)
+    values |= detectable_values(decision.detectable)
     # The target is body 1; where there is none, that number stays free.
     bodies = dict(enumerate(decision.others, start=2))
     if decision.target is not None:
@@ -109,6 +112,7 @@ def decision_from_msg(msg: Any) -> SearchNews:
     bodies = {number: target_of(status) for number, status in numbered(statuses, _BODY).items()}
     target = bodies.pop(1, None)
     frame = frame_of(msg, _WHERE)
-    decision = Decision(target, tuple(bodies.values()), left_out_of(statuses), sign_of(run), frame)
+    told = left_out_of(statuses), sign_of(run), frame, detectable_of(run)
+    decision = Decision(target, tuple(bodies.values()), *told)
     run_ns = run.whole("run") if "run" in run else None
     return SearchNews(stamp_ns, decision, run_ns, run.whole("target"), run.truth("may_move"))

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from csas_shadow_ros.core.errors import AdapterError, quoted
-from csas_shadow_ros.core.shape.result import LeftOut
+from csas_shadow_ros.core.shape.result import Detectable, LeftOut
 from csas_shadow_ros.core.shape.volume import Target
 
 from .messages import MessageFactory, check_type, frame_of, make_header, stamp_to_ns
@@ -26,6 +26,7 @@ Value = float | int | bool | str
 
 RUN = "run"
 LEFT_OUT = "left out"
+_DETECTABLE = "detectable_"
 
 
 def text_of(value: Value) -> str:
@@ -271,6 +272,28 @@ def sign_of(status: Status) -> SignEvidence | None:
 
     stated = int(status.text("sign", ("1", "-1")))
     return SignEvidence(stated, *status.reals("sign_evidence", "sign_other_evidence"))
+
+
+def detectable_values(one: Detectable | None) -> dict[str, Value]:
+    """Return the values of what a search that found nothing would have found; empty if it was not asked."""
+    return {} if one is None else {f"{_DETECTABLE}{name}": value for name, value in asdict(one).items()}
+
+
+def detectable_of(status: Status) -> Detectable | None:
+    """Read what a search that found nothing would have found; None if it was not asked.
+
+    Raises
+    ------
+    AdapterError
+        If a value is missing or no number.
+    """
+    if f"{_DETECTABLE}size_m" not in status:
+        return None
+    size_m, height_m, contrast_db = (
+        status.real(f"{_DETECTABLE}{name}", finite=True) for name in ("size_m", "height_m", "contrast_db")
+    )
+    found, places = (status.whole(f"{_DETECTABLE}{name}") for name in ("found", "places"))
+    return Detectable(size_m, height_m, contrast_db, found, places)
 
 
 def left_out_statuses(left_out: Iterable[LeftOut]) -> list[Status]:

@@ -28,7 +28,7 @@ from .imaging.masks import KeptMask
 from .imaging.segmentation import require_silhouette
 from .parameters import PipelineParameters
 from .search.decision import Decision
-from .search.pieces import NOTHING_LEFT, objects_of
+from .search.pieces import nothing_left, objects_of
 from .shape.carving import Carver, compared_shadows
 from .shape.explained import ShadowFit
 from .shape.hollows import EchoLook, matter_mesh, matter_of
@@ -448,6 +448,7 @@ class Reconstruction:
             arc_rad=self.arcs.covered_rad,
             rejected=dict(self.rejected),
             left_out=list(self.decision.left_out),
+            detectable=self.decision.detectable,
             timings_s=dict(self.timings_s),
             best_shadow=self._best[1],
             frame=self.frame or SCENE_FRAME,
@@ -552,7 +553,7 @@ class Reconstruction:
         """Add what a further body turned out to be, without what was reported before it."""
         place = body.target.position_m
         if body.given_up:
-            result.left_out.append(LeftOut(place, NOTHING_LEFT))
+            result.left_out.append(nothing_left(place))
             return
         if whole is None:
             result.left_out.append(LeftOut(place, f"no view of it was usable: {body.refused}"))

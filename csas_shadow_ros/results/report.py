@@ -358,6 +358,7 @@ def build_report(
         "datum": result.datum,
         "objects": part("objects", lambda: _objects(result, truths), []),
         "objects_left_out": result.left_out,
+        "detectable": result.detectable,
         "method": context.parameters.carving.method,
         "dimensions": part("dimensions", lambda: _dimensions(result.dimensions)),
         "threshold": result.grid.threshold if result.grid is not None else None,

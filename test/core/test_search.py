@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import trimesh
 
@@ -13,10 +14,13 @@ from csas_shadow_ros.core.errors import SpectrumSignError
 from csas_shadow_ros.core.imaging.subaperture import Spectrum
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.pipeline import run
+from csas_shadow_ros.core.search import detectable
 from csas_shadow_ros.core.search.bodies import search_image, spectrum_sign_evidence
 from csas_shadow_ros.core.search.decision import decide
-from csas_shadow_ros.core.shape.result import LeftOut, Result
-from csas_shadow_ros.core.shape.verdict import judge
+from csas_shadow_ros.core.search.detectable import detectable_of
+from csas_shadow_ros.core.search.pieces import objects_of
+from csas_shadow_ros.core.shape.result import Detectable, LeftOut, Quality, Result
+from csas_shadow_ros.core.shape.verdict import judge, no_object_reason
 from csas_shadow_ros.core.shape.volume import Target
 from csas_shadow_ros.simulation import simulate
 from csas_shadow_ros.simulation.profiles import Faults
@@ -119,6 +123,97 @@ def test_a_pole_thinner_than_a_cell_is_found_or_named():
     assert max(map(abs, result.target.position_m)) < 0.1
     if result.verdict == "undecided":
         assert "a candidate at" in result.quality.reasons[0]
+
+
+def test_a_pole_beside_a_box_that_stands_out_is_an_object_too():
+    """The likelihood of single views shows the box alone; their mean power shows the pole as well."""
+    pole = trimesh.creation.cylinder(0.05, 0.3, sections=24)
+    pole.apply_translation((0.45, 0.4, 0.15))
+    beside = box(0.4, 0.3, 0.25)
+    beside.apply_translation((-0.4, -0.3, 0.0))
+    made = simulate("small", trimesh.util.concatenate([beside, pole]), seed=1)
+    middles = [part.bounds.mean(axis=0)[:2] for part in made.truth.target.split()]
+
+    result = run(made.image, made.track, COARSE)
+
+    assert len(result.objects) == 2
+    for one, middle, size in zip(result.objects, middles, ((0.4, 0.3, 0.25), (0.1, 0.1, 0.3)), strict=True):
+        assert one.dimensions.position_m == pytest.approx(middle, abs=0.06)
+        found = one.dimensions.length_m, one.dimensions.width_m, one.dimensions.height_m
+        assert found == pytest.approx(size, abs=0.04)
+
+
+@pytest.mark.parametrize(("seed", "contrast_db"), [(1, 8.0), (3, 12.0)])
+def test_a_low_slab_is_found_and_as_high_as_it_is(seed, contrast_db):
+    """At 8 dB its own echo hides the shadow of its foot: it seems to hang, and nothing else stands there."""
+    slab = box(0.35, 0.35, 0.08)
+    made = simulate("small", slab, seed=seed, faults=Faults(contrast_db=contrast_db))
+
+    result = run(made.image, made.track, COARSE)
+
+    assert result.verdict == "object"
+    assert result.dimensions.position_m == pytest.approx((0.0, 0.0), abs=0.03)
+    assert result.dimensions.height_m == pytest.approx(0.08, abs=0.01)
+    low, high = result.dimensions.intervals["height_m"]
+    assert low < 0.08 < high
+
+
+@pytest.mark.parametrize(
+    "bed",
+    [Seabed(step_db=9.0, step_deg=30.0, step_m=0.2), Seabed(seed=1, texture_db=2.5, texture_m=0.3)],
+    ids=["step", "texture"],
+)
+def test_a_seabed_of_several_levels_hides_no_body_from_the_local_look(bed, monkeypatch):
+    """Over the whole scene's level all of the darker seabed is dark, and nothing of the brighter one is."""
+    made = simulate("tiny", "empty", seed=3, bed=bed)
+    search = search_image(made.image, made.track, Spectrum.of_image(made.image))
+    assert (search.targets, search.left_out) == ((), ())
+    told = detectable_of(search)
+    assert told.is_enough
+    assert told.size_m < 0.2
+    monkeypatch.setattr(detectable, "look_locally", lambda *_: None)
+    assert not detectable_of(search).is_enough
+
+
+def test_no_object_says_what_would_have_been_found():
+    made = simulate("small", "empty", seed=3)
+    found = run(made.image, made.track, COARSE)
+    assert (found.verdict, found.quality.verdict) == ("no object", "good")
+    least = found.detectable
+    assert (least.found, least.places) == (9, 9)
+    cell = 0.064  # of the search's views of 6°, on this profile
+    assert cell <= least.size_m <= 3.0 * cell
+    assert str(least) in no_object_reason(found)
+    # What it says holds: such a body, with the simulation's own echo, is found.
+    body = trimesh.creation.cylinder(least.size_m / 2.0, least.height_m, sections=24)
+    with_body = simulate("small", body, seed=4, position_m=(0.3, -0.4), faults=Faults(contrast_db=6.0))
+    search = search_image(with_body.image, with_body.track, Spectrum.of_image(with_body.image))
+    assert search.best is not None
+    assert search.best.position_m == pytest.approx((0.3, -0.4), abs=least.size_m)
+
+
+def test_no_object_is_limited_where_the_seabed_hides_bodies():
+    result = Result(detectable=Detectable(0.4, 0.2, 6.0, 5, 9))
+    judge(result)
+    assert (result.verdict, result.quality.verdict) == ("no object", "limited")
+    assert "found at 5 of 9 places" in result.quality.reasons[0]
+    result = Result(detectable=Detectable(0.1, 0.05, 6.0, 8, 9))
+    judge(result)
+    assert (result.verdict, result.quality) == ("no object", Quality("good", ()))
+
+
+def test_a_body_that_carving_loses_beside_an_object_is_named_as_a_candidate(box_run):
+    result = run(box_run.image, box_run.track, COARSE)
+    assert result.quality.verdict == "good"
+    nothing = replace(result.grid, occupied=np.zeros_like(result.grid.occupied))
+    objects, left_out = objects_of(nothing, (3.0, -4.0), [result.grid])
+    assert objects == []
+
+    result.left_out += left_out
+    judge(result)
+
+    assert (result.verdict, result.quality.verdict) == ("object", "limited")
+    assert result.quality.reasons[0].startswith("a candidate at (3.00, -4.00) m: ")
 
 
 def test_a_body_with_gaps_is_no_sediment():

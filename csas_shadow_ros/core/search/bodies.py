@@ -3,9 +3,9 @@
 All three are asked of the shadows: a coarse soft carving of the whole scene with narrow sub-apertures,
 which need no focus. Whatever casts a shadow of its own from all sides stands out as a body. What is then
 asked of each is whether the seabed that only its height can darken, off its own plan and on another side
-from each aspect, is dark: of a patch of dark sediment it is not. Where nothing is evident, a second look
-goes by the mean power alone, relative to its own spread over the scene: thin and faint bodies are too little
-for a likelihood that takes every view by itself. "No object" is a valid answer.
+from each aspect, is dark: of a patch of dark sediment it is not. A second look goes by the mean power alone,
+relative to its own spread over the scene: thin and faint bodies are too little for a likelihood that takes
+every view by itself. "No object" is a valid answer.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
@@ -39,6 +40,8 @@ _SEARCH_APERTURE_DEG = 6.0
 _SEARCH_STEP_DEG = 10.0
 #: Search voxels per side of the scene.
 _SEARCH_VOXELS = 110
+#: Views are smoothed over a search voxel, and over so many pixels at least.
+_SMOOTHED_PX = 4.0
 #: A search voxel is dark where the mean l_out of its (smoothed) views is under this.
 _DARK = 0.4
 #: The smallest body that the search reports, in search voxels.
@@ -48,7 +51,7 @@ _CORE = 0.28
 #: The margin is at least this many search voxels.
 _MARGIN_VOXELS = 5
 #: Powers of the search are kept as whole numbers: so many are the seabed's mean, and one says "not known".
-_MEAN, _UNKNOWN = 120, 255
+MEAN, UNKNOWN = 120, 255
 #: A second-look voxel is dark where its mean power lies so many of its layer's spreads under its layer's
 #: median. Chance alone reaches 5 in the 10^6 voxels of a scene. At 2.5 texture begins bodies, which the
 #: thrown shadow has to refuse; at 10 poles of three cells, whose shadows' far ends are blurred, are not seen.
@@ -59,6 +62,16 @@ _FAINT_POWER = 0.5
 #: No voxel of a faint body is less than so many spreads under the median: at half it runs out over the
 #: seabed, at double poles are cut to pieces.
 _LEAST_SPREADS = 2.5
+#: What is round about: a square of this side (share of the scene's). At half bodies are their own level, at
+#: double sediments are bodies.
+_ROUND_ABOUT = 1.0 / 3.0
+#: What is found over the local seabed alone throws its shadow so far: three cells of a view of 12°. At one
+#: search cell the texture of eight seabeds of 96 is a body's.
+_THROWN_LOCALLY_CELLS = 1.5
+#: So many of the views (share) are darker than what is taken for lit seabed: the middle of the upper half.
+_LIT_SHARE = 0.75
+#: No seabed is darker than this (power over the scene's mean): 13 dB under it nothing is told from the noise.
+_LEAST_LEVEL = 0.05
 #: Search voxels that begin a faint body, and how many of these are looked at, the darkest first: 20 ms each.
 _SEED_VOXELS = 4
 _MOST_SEEDS = 32
@@ -152,8 +165,10 @@ class Search:
     left_out: tuple[LeftOut, ...] = ()
     #: The thrown shadow of each target, in the same order.
     thrown: tuple[Thrown, ...] = ()
-    #: Nothing was evident at first: it was looked again, for the faint.
-    twice: bool = False
+    #: No body that stands was evident at the first look: what was found is faint.
+    is_faint: bool = False
+    #: Where nothing was found, the views that were looked at.
+    looks: tuple[Look, ...] = ()
 
     @property
     def best(self) -> Target | None:
@@ -186,29 +201,29 @@ def search_views(views: Sequence[View]) -> Search:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class Look:
     """What the search keeps of a view: l_out, and the mean power in whole numbers, both smoothed."""
 
     likelihood: View
     power: View
 
-    def power_image(self) -> View:
-        """Return the power as soft carving takes it: 0 to 1, of which the seabed's mean is `_MEAN` / 254."""
-        pixels = self.power.pixels.astype(np.float32) / np.float32(_UNKNOWN - 1)
-        pixels[self.power.pixels == _UNKNOWN] = np.nan
+    def power_image(self, most: int) -> View:
+        """Return the power, at most so much, as soft carving takes it: 0 to 1, the seabed's `MEAN` / 254."""
+        pixels = np.minimum(self.power.pixels, most).astype(np.float32) / np.float32(UNKNOWN - 1)
+        pixels[self.power.pixels == UNKNOWN] = np.nan
         return replace(self.power, pixels=pixels)
 
 
-def _search_looks(views: list[View], extent_m: float, workers: int = 2) -> list[_Look]:
+def _search_looks(views: list[View], extent_m: float, workers: int = 2) -> list[Look]:
     """Turn amplitude views into smoothed looks; empties the list, as both would be much memory."""
-    smoothing_m = max(extent_m / _SEARCH_VOXELS, 3.0 * max(views[0].info.camera.spacing_m))
-    parameters = LikelihoodParameters(smoothing_m=smoothing_m)
+    parameters = LikelihoodParameters(smoothing_m=_smoothing_m(extent_m, views[0].info.camera))
 
-    def look(_: int) -> _Look | None:
+    def look(_: int) -> Look | None:
         view = views.pop()
         try:
             levels = view_levels(view, parameters, target=False)
-            return _Look(outside_likelihood(view, parameters, levels), _power(view, levels, parameters))
+            power = _power(view, levels, parameters, smoothing_px(extent_m, view.info.camera))
+            return Look(outside_likelihood(view, parameters, levels), power)
         except ViewError:
             return None  # a view without levels has nothing to say here; it is reported where it counts
 
@@ -216,19 +231,28 @@ def _search_looks(views: list[View], extent_m: float, workers: int = 2) -> list[
         return [found for found in pool.map(look, range(len(views))) if found is not None]
 
 
-def _power(view: View, levels: Levels, parameters: LikelihoodParameters) -> View:
-    rows_m, cols_m = view.info.camera.spacing_m
-    half = parameters.smoothing_m / 2.0
-    mean = box_mean(levels.power, levels.known, (max(1, round(half / rows_m)), max(1, round(half / cols_m))))
-    pixels = np.minimum(mean * np.float32(_MEAN) + np.float32(0.5), _UNKNOWN - 1).astype(np.uint8)
-    pixels[~levels.known | levels.unknown_echoes(parameters)] = _UNKNOWN
+def _smoothing_m(extent_m: float, camera: ShadowCamera) -> float:
+    return max(extent_m / _SEARCH_VOXELS, _SMOOTHED_PX * max(camera.spacing_m))
+
+
+def smoothing_px(extent_m: float, camera: ShadowCamera) -> tuple[int, int]:
+    """Return how far (rows, columns) to either side a look's power is the mean of its view's."""
+    half_m = _smoothing_m(extent_m, camera) / 2.0
+    row_m, col_m = camera.spacing_m
+    return max(1, round(half_m / row_m)), max(1, round(half_m / col_m))
+
+
+def _power(view: View, levels: Levels, parameters: LikelihoodParameters, radius_px: tuple[int, int]) -> View:
+    mean = box_mean(levels.power, levels.known, radius_px)
+    pixels = np.minimum(mean * np.float32(MEAN) + np.float32(0.5), UNKNOWN - 1).astype(np.uint8)
+    pixels[~levels.known | levels.unknown_echoes(parameters)] = UNKNOWN
     return replace(view, pixels=pixels)
 
 
-def _search(looks: Sequence[_Look], camera: ShadowCamera, extent_m: float, *, twice: bool = True) -> Search:
+def _search(looks: Sequence[Look], camera: ShadowCamera, extent_m: float, *, twice: bool = True) -> Search:
     """Carve the whole scene coarsely and list its bodies; `camera` is any of the views'.
 
-    `twice`: look again for the faint where nothing is evident.
+    `twice`: look again, for the faint.
     """
     middle = camera.pixel_to_ground[:2] @ np.array([(camera.cols - 1) / 2.0, (camera.rows - 1) / 2.0, 1.0])
     voxel = extent_m / _SEARCH_VOXELS
@@ -238,20 +262,24 @@ def _search(looks: Sequence[_Look], camera: ShadowCamera, extent_m: float, *, tw
     mean = _carved(volume, (look.likelihood for look in looks))
     with np.errstate(invalid="ignore"):
         bodies = _bodies(mean < _DARK, mean, volume)
-    judged = _Judged()
+    judged = Judged()
     for body in bodies:
         if body.core <= _CORE:
             judged.add(body, looks)
-    twice = twice and not any(target.stands for target, _ in judged.found)
+    is_faint = not judged.stands
     if twice:
-        _look_again(judged, looks, volume)
-    if twice and not any(target.stands for target, _ in judged.found):
-        leaving = _leaving(looks, (float(middle[0]), float(middle[1])), extent_m)
-        judged.left_out += [] if leaving is None else [leaving]
+        look_again(judged, looks, volume)
+        if leaving := None if judged.stands else _leaving(looks, volume):
+            judged.left_out.append(leaving)
+        else:
+            look_locally(judged, looks, volume)
+            # Where nothing stands, no shadows cross: it does hang, or its foot is faint.
+            judged.found += [] if judged.stands else judged.hanging
     # Sorting is stable: what is as evident stays in the order of its place.
-    found = sorted(judged.found, key=lambda one: -one[0].evidence)
-    targets, thrown = tuple(target for target, _ in found), tuple(thrown for _, thrown in found)
-    return Search(targets, volume, mean, tuple(judged.left_out), thrown, twice)
+    found = sorted(judged.found, key=lambda one: (one[2] and not is_faint, -one[0].evidence))
+    targets, thrown = tuple(target for target, _, _ in found), tuple(thrown for _, thrown, _ in found)
+    kept = () if targets else tuple(looks)
+    return Search(targets, volume, mean, tuple(judged.left_out), thrown, is_faint, kept)
 
 
 def _carved(volume: Volume, images: Iterable[View]) -> NDArray[np.float32]:
@@ -300,7 +328,7 @@ class _Body:
             stands_on_seabed(float(z[0]) - d / 2, top),
         )
 
-    def thrown(self, looks: Sequence[_Look]) -> Thrown:
+    def thrown(self, looks: Sequence[Look]) -> Thrown:
         """Look where its height alone can darken the seabed.
 
         Where the whole body's shadow is not dark, that of its darkest part is looked at, off the whole plan:
@@ -314,9 +342,9 @@ class _Body:
         if whole.power <= _CAST:
             return whole
         part = self._thrown(looks, core, powers < core + _STRICT * (1.0 - core))
-        return part if part.power <= _CAST and part.length_m >= _THROWN_CELLS * _cell_m(looks) else whole
+        return part if part.power <= _CAST and part.length_m >= _THROWN_CELLS * cell_m(looks) else whole
 
-    def _powers(self, looks: Sequence[_Look]) -> NDArray[np.float64]:
+    def _powers(self, looks: Sequence[Look]) -> NDArray[np.float64]:
         """Mean power of each voxel's shadow, the seabed's 1; NaN where no view knows it."""
         x, y, z = self._places()
         total, seen = np.zeros(len(x)), np.zeros(len(x), np.int64)
@@ -330,7 +358,7 @@ class _Body:
         k, j, i = self.voxels
         return self.volume.x_m[i], self.volume.y_m[j], self.volume.z_m[k]
 
-    def _thrown(self, looks: Sequence[_Look], core: float, casters: NDArray[np.bool_]) -> Thrown:
+    def _thrown(self, looks: Sequence[Look], core: float, casters: NDArray[np.bool_]) -> Thrown:
         """Look at what some of its voxels throw off the plan of all."""
         volume, (_, j, i) = self.volume, self.voxels
         d = volume.voxel_size_m
@@ -355,13 +383,13 @@ class _Body:
         return Thrown(length, share, core, front)
 
 
-def _cell_m(looks: Sequence[_Look]) -> float:
+def cell_m(looks: Sequence[Look]) -> float:
     """Return the larger side of a resolution cell."""
     return max(looks[0].power.info.resolution_m)
 
 
 def _cast(
-    look: _Look, x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]
+    look: Look, x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return where the rays over points meet the seabed."""
     sonar_x, sonar_y, sonar_z = map(float, look.power.info.camera.sonar_m)
@@ -391,9 +419,9 @@ def _powers_at(
     u, v, _ = camera.ground_to_pixel @ np.stack([x_m, y_m, np.ones_like(x_m)])
     iu, iv = np.rint(u).astype(np.intp), np.rint(v).astype(np.intp)
     inside = (iu >= 0) & (iv >= 0) & (iu < camera.cols) & (iv < camera.rows)
-    values = np.full(len(x_m), _UNKNOWN, np.uint8)
+    values = np.full(len(x_m), UNKNOWN, np.uint8)
     values[inside] = pixels[iv[inside], iu[inside]]
-    return values / float(_MEAN), values != _UNKNOWN
+    return values / float(MEAN), values != UNKNOWN
 
 
 def _bodies(
@@ -413,25 +441,45 @@ def _bodies(
 
 
 @dataclass
-class _Judged:
+class Judged:
     """Bodies that were found, and those that were not believed."""
 
-    found: list[tuple[Target, Thrown]] = field(default_factory=list)
+    #: What it is, the shadow that it throws, and whether it is faint.
+    found: list[tuple[Target, Thrown, bool]] = field(default_factory=list)
     left_out: list[LeftOut] = field(default_factory=list)
+    #: What is faint and does not reach down to the seabed, likewise.
+    hanging: list[tuple[Target, Thrown, bool]] = field(default_factory=list)
     #: Where the bodies are, on the seabed: (y, x) numbers in the search's volume.
     plans: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = field(default_factory=list)
 
-    def add(self, body: _Body, looks: Sequence[_Look], *, faint: bool = False) -> None:
-        """Take a body in by the shadow that it throws."""
+    @property
+    def stands(self) -> bool:
+        """Whether any body that was found stands on the seabed."""
+        return any(target.stands for target, _, _ in self.found)
+
+    @property
+    def places(self) -> list[tuple[float, float]]:
+        """Places of all that is, or may well be, a body."""
+        bodies = [target.position_m for target, _, _ in (*self.found, *self.hanging)]
+        return bodies + [left.position_m for left in self.left_out if left.strong]
+
+    def add(
+        self,
+        body: _Body,
+        looks: Sequence[Look],
+        *,
+        faint: bool = False,
+        least_cells: float = _THROWN_CELLS,
+    ) -> None:
+        """Take a body in by the shadow that it throws, so many cells at least."""
         target, thrown = body.target(), body.thrown(looks)
-        self.plans.append(body.voxels[1:])
         x, y = target.position_m
-        cell = _cell_m(looks)
-        if not target.stands:
-            if not faint:
-                self.found.append((target, thrown))
-        elif faint and (thrown.length_m < _THROWN_CELLS * cell or not thrown.power < _NOT_CAST):
+        cell = cell_m(looks)
+        if faint and (thrown.length_m < least_cells * cell or not thrown.power < _NOT_CAST):
             return  # texture of the seabed, which every scene has
+        self.plans.append(body.voxels[1:])
+        if not target.stands and not faint:
+            self.found.append((target, thrown, faint))
         elif thrown.length_m < _THROWN_CELLS * cell:
             self.left_out.append(
                 LeftOut(
@@ -442,7 +490,7 @@ class _Judged:
                 )
             )
         elif thrown.power <= _CAST:
-            self.found.append((target, thrown))
+            (self.found if target.stands else self.hanging).append((target, thrown, faint))
         elif not thrown.power < _NOT_CAST:
             self.left_out.append(
                 LeftOut((x, y), "dark sediment: the same seabed is dark from all sides, no shadow moves")
@@ -458,9 +506,72 @@ class _Judged:
             )
 
 
-def _look_again(judged: _Judged, looks: Sequence[_Look], volume: Volume) -> None:
-    """Look for the thin and the faint, whose power is low in the mean of all views."""
-    power = _carved(volume, (look.power_image() for look in looks)) * np.float32((_UNKNOWN - 1) / _MEAN)
+def _over_local_seabed(looks: Sequence[Look], volume: Volume) -> list[Look]:
+    """Divide each view's power by that of the seabed round about, which stays where it is from view to view.
+
+    A body's shadow covers one place from less than half of the circle, so the upper half of the views is lit
+    seabed. The median round about keeps the edge of a sediment where it is.
+    """
+    x, y = (values.ravel() for values in np.meshgrid(volume.x_m, volume.y_m))
+    told = [_powers_at(look.power, x, y) for look in looks]
+    powers = np.sort([np.where(known, values, np.inf) for values, known in told], axis=0)
+    last = np.maximum(np.sum([known for _, known in told], axis=0) - 1, 0)
+    half, lit = (
+        np.take_along_axis(powers, np.rint(share * last).astype(np.intp)[None], axis=0)[0]
+        for share in (0.5, _LIT_SHARE)
+    )
+    known = np.isfinite(lit) & (lit > 0.0)
+    # Lit looks are brighter than all looks are in the median, on any seabed by as much.
+    lit = np.where(known, lit * float(np.median(half[known] / lit[known])), 1.0)
+    codes = np.clip(lit * MEAN, 1, UNKNOWN - 1).astype(np.uint8).reshape(len(volume.y_m), len(volume.x_m))
+    side = 2 * round(_ROUND_ABOUT * _SEARCH_VOXELS / 2.0) + 1
+    level = np.maximum(cv2.medianBlur(codes, side).astype(np.float32) / MEAN, _LEAST_LEVEL)
+    d = volume.voxel_size_m
+    to_grid = np.array([[1 / d, 0.0, -volume.x_m[0] / d], [0.0, 1 / d, -volume.y_m[0] / d], [0.0, 0.0, 1.0]])
+    flat = []
+    for look in looks:
+        camera, pixels = look.power.info.camera, look.power.pixels
+        placed = cv2.warpAffine(
+            level,
+            (to_grid @ camera.pixel_to_ground)[:2],
+            (camera.cols, camera.rows),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        over = np.minimum(pixels / placed + np.float32(0.5), UNKNOWN - 1).astype(np.uint8)
+        over[pixels == UNKNOWN] = UNKNOWN
+        flat.append(replace(look, power=replace(look.power, pixels=over)))
+    return flat
+
+
+def look_again(judged: Judged, looks: Sequence[Look], volume: Volume) -> None:
+    """Look for the thin and the faint, whose power is low in the mean of all views.
+
+    Over the whole scene's seabed: a large body is most of what is round about.
+    """
+    _look_over(judged, looks, volume, 0.0, _THROWN_CELLS, UNKNOWN - 1)
+
+
+def look_locally(judged: Judged, looks: Sequence[Look], volume: Volume) -> None:
+    """Look again over the local seabed: on dark sediment, or beside it, all is dark or nothing.
+
+    No view counts as brighter than the seabed: a small body's own echo would hide in the mean that its shadow
+    is dark.
+    """
+    local = _over_local_seabed(looks, volume)
+    _look_over(judged, local, volume, _FAINT_POWER, _THROWN_LOCALLY_CELLS, MEAN)
+
+
+def _look_over(
+    judged: Judged,
+    looks: Sequence[Look],
+    volume: Volume,
+    reach: float,
+    least_cells: float,
+    most: int,
+) -> None:
+    """Grow bodies from what is dark; at least what has less than `reach` of its layer's median is one's."""
+    power = _carved(volume, (look.power_image(most) for look in looks)) * np.float32((UNKNOWN - 1) / MEAN)
     seeds = np.zeros(power.shape, np.bool_)
     limits = np.zeros((len(power), 1, 1), np.float32)
     for layer, out, limit in zip(power, seeds, limits, strict=True):
@@ -471,7 +582,7 @@ def _look_again(judged: _Judged, looks: Sequence[_Look], volume: Volume) -> None
         spread = 1.4826 * float(np.median(np.abs(known - median)))
         with np.errstate(invalid="ignore"):
             out[:] = layer < max(median - _FAINT_SPREADS * spread, _FAINT_POWER * median)
-        limit[:] = median - _LEAST_SPREADS * spread
+        limit[:] = max(median - _LEAST_SPREADS * spread, reach * median)
     taken = np.zeros(power.shape, np.bool_)
     for j, i in judged.plans:
         taken[:, j, i] = True  # it was judged at the first look
@@ -490,15 +601,16 @@ def _look_again(judged: _Judged, looks: Sequence[_Look], volume: Volume) -> None
         (first_j, last_j), (first_i, last_i) = ((n.min(), n.max()) for n in whole[1:])
         inside = first_j > 0 and first_i > 0 and last_j < power.shape[1] - 1 and last_i < power.shape[2] - 1
         if len(whole[0]) >= _MIN_VOXELS and inside:  # what leads out of the scene is its level, no body
-            judged.add(_Body(volume, whole, seed.core), looks, faint=True)
+            judged.add(_Body(volume, whole, seed.core), looks, faint=True, least_cells=least_cells)
 
 
-def _leaving(looks: Sequence[_Look], middle: tuple[float, float], extent_m: float) -> LeftOut | None:
+def _leaving(looks: Sequence[Look], volume: Volume) -> LeftOut | None:
     """Return the body whose shadows leave the image, if most views show large ones that move and end there.
 
     Such a body has no top that is dark from all sides, and so the search sees nothing of it.
     """
-    d = extent_m / _SEARCH_VOXELS
+    d, extent_m = volume.voxel_size_m, volume.size_m[0]
+    middle = float(volume.x_m.mean()), float(volume.y_m.mean())
     side = math.ceil(1.5 * _SEARCH_VOXELS)  # a square scene reaches over it at its corners
     at = (np.arange(side) - (side - 1) / 2.0) * d
     x, y = (values.ravel() for values in np.meshgrid(at + middle[0], at + middle[1]))
@@ -511,8 +623,8 @@ def _leaving(looks: Sequence[_Look], middle: tuple[float, float], extent_m: floa
     reaches, starts = [], []
     for look in looks:
         camera, pixels = look.power.info.camera, look.power.pixels
-        known = pixels != _UNKNOWN
-        labels, count = scipy.ndimage.label(known & (pixels < _SHADOW_POWER * _MEAN))
+        known = pixels != UNKNOWN
+        labels, count = scipy.ndimage.label(known & (pixels < _SHADOW_POWER * MEAN))
         row, col = np.nonzero(labels)
         if not count or not row.size:
             continue
@@ -638,7 +750,7 @@ def spectrum_sign_evidence(
     turned = list(_under_other_sign(looks, _searching(other_image, track, spectrum)))
     stated = _search(looks, camera, extent)
     # What is only faint proves nothing before as much was looked for under the other sign.
-    other = _search(turned, camera, extent, twice=stated.twice)
+    other = _search(turned, camera, extent, twice=stated.is_faint)
     best = stated.best.evidence if stated.best is not None else 0.0
     if leaving := [left for left in other.left_out if left.reason.startswith(LEAVES)]:
         best = 0.0
@@ -650,26 +762,26 @@ def spectrum_sign_evidence(
         if not thrown.front >= _PLAIN
     ]
     against = max((target.evidence for target in contrary), default=0.0)
-    if other.twice:
+    if faint := stated.is_faint and other.is_faint:
         # What is faint proves no sign wrong. It raises a doubt where the search names nothing else.
         if against > _SIGN_RATIO * best and not stated.left_out:
-            faint = max(contrary, key=lambda target: target.evidence)
-            doubt = LeftOut(faint.position_m, f"{OTHER_SIGN} a faint body throws a shadow here")
+            body = max(contrary, key=lambda target: target.evidence)
+            doubt = LeftOut(body.position_m, f"{OTHER_SIGN} a faint body throws a shadow here")
             stated = replace(stated, left_out=(*stated.left_out, doubt))
         against = min(against, best)
     evidence = SignEvidence(sign, best, against)
-    evident = other.best is not None and not other.twice and other.best.evidence > _SIGN_RATIO * best
+    evident = other.best is not None and not faint and other.best.evidence > _SIGN_RATIO * best
     if other.best is not None and evident and not contrary:
         hollow = LeftOut(other.best.position_m, HOLLOW, strong=True)
         stated = replace(stated, left_out=(*stated.left_out, hollow))
     return evidence, stated
 
 
-def _under_other_sign(looks: Sequence[_Look], other: SubApertures) -> Iterator[_Look]:
+def _under_other_sign(looks: Sequence[Look], other: SubApertures) -> Iterator[Look]:
     """Give the views of the other spectrum sign: that of aspect θ is that of θ + π, turned by 180°."""
     for look in looks:
         try:
             info = other.info(float((look.power.info.aspect_rad + math.pi) % TWO_PI))
         except ViewError:
             continue
-        yield _Look(*(View(info, view.pixels[::-1, ::-1]) for view in (look.likelihood, look.power)))
+        yield Look(*(View(info, view.pixels[::-1, ::-1]) for view in (look.likelihood, look.power)))

@@ -25,9 +25,10 @@ from ..parameters import (
     ShadowParameters,
     TargetParameters,
 )
-from ..shape.result import LeftOut
+from ..shape.result import Detectable, LeftOut
 from ..shape.volume import Target
 from .bodies import Search, SignEvidence, search_image, search_views, spectrum_sign_evidence
+from .detectable import detectable_of
 
 #: How many views from all round look for the target: one every 10°, as the search in an image makes them.
 _SEARCH_VIEWS = 36
@@ -50,6 +51,8 @@ class Decision:
         Whether the shadows fit the stated spectrum sign; None if it was not checked.
     frame : str or None
         Name of the scene frame that places are in; None: that of the views, whichever it is.
+    detectable : Detectable or None
+        Where the search found nothing: what it would have found.
     """
 
     target: Target | None
@@ -57,6 +60,7 @@ class Decision:
     left_out: tuple[LeftOut, ...] = ()
     sign: SignEvidence | None = None
     frame: str | None = None
+    detectable: Detectable | None = None
 
     def require_frame(self, view: ViewInfo) -> None:
         """Refuse a view in another frame.
@@ -123,7 +127,10 @@ def decide(
         return Decision(_given(found, p), sign=sign)
     doubted = search.left_out if search is not None else ()
     if not found:
-        return Decision(None, left_out=doubted, sign=sign)
+        detectable = None  # where something may be an object the verdict is open as it is
+        if search is not None and not any(left.strong for left in doubted):
+            detectable = detectable_of(search)
+        return Decision(None, left_out=doubted, sign=sign, detectable=detectable)
     others: list[Target] = []
     left_out = list(doubted)
     for body in found[1:]:

@@ -27,6 +27,11 @@ _SAME_BODY = 0.25
 _MARGIN_VOXELS = 3
 
 
+def nothing_left(place_m: tuple[float, float]) -> LeftOut:
+    """Return what is left of a body of the search that no voxel is: a candidate, as it throws a shadow."""
+    return LeftOut(place_m, NOTHING_LEFT, strong=True)
+
+
 def connected_pieces(occupied: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
     """Return the separate pieces of a carved grid, the largest first.
 
@@ -92,7 +97,7 @@ def objects_of(
     """
     pieces = connected_pieces(grid.occupied)
     if not pieces:
-        return [], [LeftOut(place_m, NOTHING_LEFT)]
+        return [], [nothing_left(place_m)]
     objects: list[VoxelGrid] = []
     left_out = []
     for piece in pieces:

@@ -110,6 +110,40 @@ class LeftOut:
     strong: bool = False
 
 
+@dataclass(frozen=True)
+class Detectable:
+    """What a search that found nothing would have found: shadows put into its own views.
+
+    Parameters
+    ----------
+    size_m : float
+        How wide the body is.
+    height_m : float
+        How high it is.
+    contrast_db : float
+        How far its shadow lies under the seabed.
+    found, places : int
+        At how many places it was found, of how many.
+    """
+
+    size_m: float
+    height_m: float
+    contrast_db: float
+    found: int
+    places: int
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether it is found at all places but one."""
+        return self.found >= self.places - 1
+
+    def __str__(self) -> str:
+        return (
+            f"a body {self.size_m:.2f} m wide and {self.height_m:.2f} m high with {self.contrast_db:g} dB of"
+            f" contrast would have been found at {self.found} of {self.places} places"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class ObjectResult:
     """One object of the scene.
@@ -191,6 +225,8 @@ class Result:
         What else stands on the seabed, in the order of the search's evidence.
     left_out : list of LeftOut
         Bodies of the search that are no objects, and why.
+    detectable : Detectable or None
+        Where the search found nothing: what it would have found.
     timings_s : dict
         Seconds of wall time by step.
     frame : str
@@ -224,6 +260,7 @@ class Result:
     best_shadow: View | None = None
     further: list[ObjectResult] = field(default_factory=list)
     left_out: list[LeftOut] = field(default_factory=list)
+    detectable: Detectable | None = None
     timings_s: dict[str, float] = field(default_factory=dict)
     frame: str = SCENE_FRAME
     datum: Datum | None = None

@@ -87,6 +87,9 @@ def _decide(result: Result, reasons: list[str]) -> int:
         if doubts := [left.reason for left in result.left_out if left.reason.startswith(OTHER_SIGN)]:
             reasons += [f"spectrum_sign may be wrong: {doubt}" for doubt in doubts]
             worst = 2
+        elif beside := _candidates(result):
+            reasons += beside
+            worst = 1
     elif result.target is not None and not result.views_used:
         result.verdict = "undecided"
         reasons.append(f"no view of the target was usable{': ' if first else ''}{first}")
@@ -104,6 +107,9 @@ def _decide(result: Result, reasons: list[str]) -> int:
         elif faint := [one for one in result.left_out if one.reason.startswith(OTHER_SIGN)]:
             told = "nothing tells the spectrum_sign"
             reasons += [f"{told}: {one.reason}, at {place_text(one.position_m)}" for one in faint]
+            worst = 1
+        if not reasons and result.detectable is not None and not result.detectable.is_enough:
+            reasons.append(f"the seabed hides bodies: {result.detectable}")
             worst = 1
     return worst
 
@@ -178,16 +184,25 @@ def _half_along(size: Dimensions, way: NDArray[np.float64]) -> float:
     return 0.5 * (size.length_m * abs(math.cos(turned)) + size.width_m * abs(math.sin(turned)))
 
 
+def _holds(size: Dimensions, place_m: tuple[float, float]) -> bool:
+    """Say whether a place lies within a plan's rectangle."""
+    x, y = np.subtract(place_m, size.position_m)
+    cos, sin = math.cos(size.heading_rad), math.sin(size.heading_rad)
+    return bool(
+        abs(x * cos + y * sin) <= size.length_m / 2.0 and abs(y * cos - x * sin) <= size.width_m / 2.0
+    )
+
+
 def _candidates(result: Result) -> list[str]:
-    """Name what may be an object and could not be carved."""
+    """Name what may be an object and could not be carved, where no object stands."""
     found = [
         f"a candidate at {place_text(left.position_m)}: {left.reason}"
         for left in result.left_out
-        if left.strong
+        if left.strong and not any(_holds(one.dimensions, left.position_m) for one in result.objects)
     ]
     target = result.target
     # A volume that was given tells nothing of a shadow in it; one that the search found does.
-    if target is not None and result.final and not math.isnan(target.evidence):
+    if not result.objects and target is not None and result.final and not math.isnan(target.evidence):
         found.insert(
             0,
             f"a candidate at {place_text(target.position_m)}: its shadow is too thin or too faint to carve"
@@ -268,7 +283,8 @@ def cut_sides(grid: VoxelGrid) -> list[str]:
 def no_object_reason(result: Result) -> str:
     """Say why there is no object."""
     if result.target is None:
-        return "nothing casts a shadow of its own from all sides"
+        told = "" if result.detectable is None else f"; {result.detectable}"
+        return f"nothing casts a shadow of its own from all sides{told}"
     if not result.views_used:
         return "no view of the target was usable"
     return "no voxel of the carved volume lies in shadow from all sides"
