@@ -145,7 +145,7 @@ def decide(
 
 def _given(found: Iterable[Target], p: TargetParameters) -> Target:
     position = (p.position_m[0], p.position_m[1])
-    here = [t for t in found if _covers(t, position)]
+    here = [t for t in found if t.covers(position)]
     if here:
         return _sized(replace(here[0], position_m=position), p)
     if all(s > 0 for s in p.size_m):
@@ -159,12 +159,6 @@ def _given(found: Iterable[Target], p: TargetParameters) -> Target:
 def _sized(target: Target, p: TargetParameters) -> Target:
     size = tuple(given or auto for given, auto in zip(p.size_m, target.size_m, strict=True))
     return replace(target, size_m=(size[0], size[1], size[2]))
-
-
-def _covers(target: Target, position_m: tuple[float, float]) -> bool:
-    return all(
-        abs(p - t) <= s / 2 for p, t, s in zip(position_m, target.position_m, target.size_m, strict=False)
-    )
 
 
 def decide_by_image(

@@ -184,21 +184,12 @@ def _half_along(size: Dimensions, way: NDArray[np.float64]) -> float:
     return 0.5 * (size.length_m * abs(math.cos(turned)) + size.width_m * abs(math.sin(turned)))
 
 
-def _holds(size: Dimensions, place_m: tuple[float, float]) -> bool:
-    """Say whether a place lies within a plan's rectangle."""
-    x, y = np.subtract(place_m, size.position_m)
-    cos, sin = math.cos(size.heading_rad), math.sin(size.heading_rad)
-    return bool(
-        abs(x * cos + y * sin) <= size.length_m / 2.0 and abs(y * cos - x * sin) <= size.width_m / 2.0
-    )
-
-
 def _candidates(result: Result) -> list[str]:
-    """Name what may be an object and could not be carved, where no object stands."""
+    """Name what may be an object and could not be carved, outside of what was carved round objects."""
     found = [
         f"a candidate at {place_text(left.position_m)}: {left.reason}"
         for left in result.left_out
-        if left.strong and not any(_holds(one.dimensions, left.position_m) for one in result.objects)
+        if left.strong and not any(one.target.covers(left.position_m) for one in result.objects)
     ]
     target = result.target
     # A volume that was given tells nothing of a shadow in it; one that the search found does.

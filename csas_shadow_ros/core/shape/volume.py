@@ -55,6 +55,12 @@ class Target:
         """Distance from the middle within which the target's own shadows begin (margin excluded)."""
         return 0.5 * math.hypot(self.size_m[0], self.size_m[1]) / (1.0 + 2.0 * MARGIN_SHARE)
 
+    def covers(self, position_m: tuple[float, float]) -> bool:
+        """Say whether a place lies in the volume to carve."""
+        return all(
+            abs(p - t) <= s / 2 for p, t, s in zip(position_m, self.position_m, self.size_m, strict=False)
+        )
+
     def volume(self, voxel_size_m: float) -> Volume:
         """Return the lattice to carve."""
         return Volume.around(self.position_m, self.size_m, voxel_size_m)
