@@ -277,6 +277,10 @@ def test_the_height_is_where_the_cap_begins(half_m):
     cap = cap_of(grid_of(occupied), GRAZING)
     assert cap.begins_m == pytest.approx(0.2, abs=0.75 * VOLUME.voxel_size_m)
     assert cap.top_m > 0.2 + 0.5 * math.tan(GRAZING) * half_m
+    # One voxel too many on its tip does not move where it begins.
+    k, j, i = (int(index) for index in np.argwhere(occupied)[-1])
+    occupied[k + 1, j, i] = True
+    assert cap_of(grid_of(occupied), GRAZING).begins_m == pytest.approx(cap.begins_m, abs=1e-9)
 
 
 @pytest.mark.parametrize("radius_m", [0.25, 0.4, 0.6])

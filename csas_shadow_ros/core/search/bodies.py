@@ -40,8 +40,9 @@ _SEARCH_APERTURE_DEG = 6.0
 _SEARCH_STEP_DEG = 10.0
 #: Search voxels per side of the scene.
 _SEARCH_VOXELS = 110
-#: Views are smoothed over a search voxel, and over so many pixels at least.
-_SMOOTHED_PX = 2.0
+#: Views are smoothed over a search voxel, and over so many pixels at least: half of it is a whole number, or
+#: the last digit of a spacing would decide.
+_SMOOTHED_PX = 4.0
 #: A search voxel is dark where the mean l_out of its (smoothed) views is under this.
 _DARK = 0.4
 #: The smallest body that the search reports, in search voxels.
