@@ -522,6 +522,8 @@ def _over_local_seabed(looks: Sequence[Look], volume: Volume) -> list[Look]:
         for share in (0.5, _LIT_SHARE)
     )
     known = np.isfinite(lit) & (lit > 0.0)
+    if not known.any():
+        return list(looks)
     # Lit looks are brighter than all looks are in the median, on any seabed by as much.
     lit = np.where(known, lit * float(np.median(half[known] / lit[known])), 1.0)
     codes = np.clip(lit * MEAN, 1, UNKNOWN - 1).astype(np.uint8).reshape(len(volume.y_m), len(volume.x_m))
