@@ -123,7 +123,7 @@ def remove_unmade_ports() -> list[Path]:
     return [port for port in ports if _remove_if_unmade(port, LOCKED_S)]
 
 
-def _remove_if_unmade(port: Path, least_age_s: float = 0.0) -> bool:
+def _remove_if_unmade(port: Path, least_age_s: float = -math.inf) -> bool:
     with contextlib.suppress(OSError), port.open("r+b") as file:
         old = time.time() - os.fstat(file.fileno()).st_mtime > least_age_s
         if old and file.read(4) in (_EMPTY, _UNMADE, _IN_MAKING):
