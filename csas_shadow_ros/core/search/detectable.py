@@ -23,8 +23,6 @@ from .bodies import MEAN, UNKNOWN, Judged, Look, Search, cell_m, look_again, loo
 _CONTRAST_DB = 6.0
 #: From the scene's middle so far out, to either side and along both axes (share of its side): nine places.
 _PLACES = (-0.3, 0.0, 0.3)
-#: It is found where it is at so many of the places; one may be a patch that hides it.
-_LEAST_PLACES = 8
 #: It is half as high as wide, like many mines. Its width: so many of the search's resolution cells at first,
 #: each time by the factor larger, and up to this share of the scene's side, where two places would touch.
 _LEAST_CELLS, _FACTOR, _LARGEST = 1.0, math.sqrt(2.0), 1.0 / 6.0
@@ -61,8 +59,9 @@ def detectable_of(search: Search) -> Detectable | None:
         at = np.array(judged.places).reshape(-1, 2)
         near = max(size, 2.0 * volume.voxel_size_m)
         found = sum(bool((np.hypot(*(at - place).T) <= near).any()) for place in places)
-        if found >= _LEAST_PLACES or size * _FACTOR > _LARGEST * side_m:
-            return Detectable(size, height, _CONTRAST_DB, found, len(places))
+        told = Detectable(size, height, _CONTRAST_DB, found, len(places))
+        if told.is_enough or size * _FACTOR > _LARGEST * side_m:
+            return told
         size *= _FACTOR
 
 

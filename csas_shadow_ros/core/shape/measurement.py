@@ -601,11 +601,18 @@ def upright_height(
     shapes = [shape == "straight" for side in sides for shape in side.shapes]
     if not shapes or float(np.mean(shapes)) <= _MOST:
         return None
+    height, agreed = _told_height(sides, dimensions, sigma_m)
+    near = min(abs(height - top) for top in tops_m) <= _UPRIGHT_VOXELS * voxel_size_m
+    return height if agreed and near else None
+
+
+def _told_height(
+    sides: Sequence[SilhouetteSides], dimensions: Dimensions, sigma_m: float
+) -> tuple[float, bool]:
+    """Return the height (m) that the shadows' lengths tell, and whether most views agree on it."""
     told = np.array([shadow_height(side, dimensions) for side in sides])
     height = float(np.percentile(told, _UPRIGHT_PERCENTILE))
-    agree = float(np.mean(np.abs(told - height) <= sigma_m))
-    near = min(abs(height - top) for top in tops_m) <= _UPRIGHT_VOXELS * voxel_size_m
-    return height if agree > _MOST and near else None
+    return height, float(np.mean(np.abs(told - height) <= sigma_m)) > _MOST
 
 
 def standing_height(
@@ -627,12 +634,10 @@ def standing_height(
     sigma_m : float
         Standard deviation of the height that one view tells, m.
     """
-    told = np.array([shadow_height(side, dimensions) for side in sides])
-    height = float(np.percentile(told, _UPRIGHT_PERCENTILE))
+    height, agreed = _told_height(sides, dimensions, sigma_m)
     areas = grid.occupied.sum(axis=(1, 2))[grid.volume.z_m + grid.volume.voxel_size_m / 4.0 <= height]
-    if not areas.any() or areas[-1] < _STANDING * areas.max():
-        return None
-    return height if float(np.mean(np.abs(told - height) <= sigma_m)) > _MOST else None
+    stands = bool(areas.any()) and areas[-1] >= _STANDING * areas.max()
+    return height if agreed and stands else None
 
 
 def shadow_height(side: SilhouetteSides, dimensions: Dimensions) -> float:

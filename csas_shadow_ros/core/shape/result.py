@@ -134,7 +134,7 @@ class Detectable:
 
     @property
     def is_enough(self) -> bool:
-        """Whether it is found at all places but one."""
+        """Whether it is found at all places but one: one may be a patch that hides it."""
         return self.found >= self.places - 1
 
     def __str__(self) -> str:
