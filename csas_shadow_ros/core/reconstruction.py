@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -28,12 +28,13 @@ from .imaging.masks import KeptMask
 from .imaging.segmentation import require_silhouette
 from .parameters import PipelineParameters
 from .search.decision import Decision
-from .search.pieces import nothing_left, objects_of
+from .search.pieces import APART_CELLS, nothing_left, objects_of, without_neighbours
 from .shape.carving import Carver, compared_shadows
 from .shape.explained import ShadowFit
 from .shape.hollows import EchoLook, matter_mesh, matter_of
 from .shape.measurement import (
     SilhouetteSides,
+    doubted,
     levels_of_mask,
     measure_object,
     shadow_height,
@@ -223,6 +224,16 @@ def _measured(
     mesh = mesh_from_grid(grid)
     found = measure_object(grid, mesh, sides) if final else measure(mesh)
     return mesh, found.rounded(grid.volume.voxel_size_m)
+
+
+def _doubted(found: Dimensions, fits: Mapping[int, ShadowFit], grid: VoxelGrid) -> Dimensions:
+    """Widen intervals by the shares of shadow that an object leaves unexplained, or casts on lit seabed."""
+    shares = [
+        float(np.mean(known))
+        for name in ("unexplained", "lit")
+        if (known := [share for fit in fits.values() if math.isfinite(share := getattr(fit, name))])
+    ]
+    return doubted(found, sum(shares)).rounded(grid.volume.voxel_size_m)
 
 
 class Reconstruction:
@@ -453,11 +464,11 @@ class Reconstruction:
             best_shadow=self._best[1],
             frame=self.frame or SCENE_FRAME,
         )
-        shapes = self._shapes() if final else {}
+        shapes, rest = self._shapes() if final else {}, None
         if self.stamps:
             body = self.bodies[0]
             if final:
-                result.grid, result.other_grid = shapes[0]
+                (result.grid, result.other_grid), rest = self._without_neighbours(shapes[0])
             else:
                 result.grid = body.carver.first_look()
             result.timings_s["carve"] = time.perf_counter() - began
@@ -471,10 +482,11 @@ class Reconstruction:
                     self._measure(result, body)
                     self._open_hollows(result, matter.result())
                 result.timings_s["shape"] = time.perf_counter() - began - result.timings_s["carve"]
-        if final and len(self.bodies) > 1:
+        if final and (len(self.bodies) > 1 or rest is not None):
             since = time.perf_counter()
             for number, body in enumerate(self.bodies[1:], start=1):
                 self._add_objects(result, body, shapes[number][0] if number in shapes else None)
+            self._add_neighbours(result, rest)
             result.timings_s["objects"] = time.perf_counter() - since
         if final and result.objects and self.stamps:
             since = time.perf_counter()
@@ -509,14 +521,23 @@ class Reconstruction:
             )
 
     def _compare_shadows(self, result: Result) -> None:
-        """Note of each view how well what was found explains its shadow."""
+        """Note how well what was found explains each view; what it does not widens intervals."""
         if result.grid is None:
             return
         grids = [result.grid, *(one.grid for one in result.further)]
-        for stamp, fit in self.bodies[0].shadow_fits(grids).items():
+        fits = self.bodies[0].shadow_fits(grids)
+        for stamp, fit in fits.items():
             if stamp in result.evidence:
                 told = replace(result.evidence[stamp], unexplained=fit.unexplained, lit=fit.lit)
                 result.evidence[stamp] = told
+        if result.dimensions is not None:
+            result.dimensions = _doubted(result.dimensions, fits, result.grid)
+        bodies = {id(body.target): body for body in self.bodies[1:]}
+        for place, one in enumerate(result.further):
+            body = bodies.get(id(one.target))
+            if body is not None and one.dimensions.intervals:
+                fits = body.shadow_fits([one.grid, *(grid for grid in grids if grid is not one.grid)])
+                result.further[place] = replace(one, dimensions=_doubted(one.dimensions, fits, one.grid))
 
     @staticmethod
     def _open_hollows(result: Result, matter: NDArray[np.bool_]) -> None:
@@ -535,6 +556,8 @@ class Reconstruction:
         """
         usable = {n: body for n, body in enumerate(self.bodies) if body.carver.stamps and not body.given_up}
         shapes = {n: body.shape() for n, body in usable.items()}
+        if 0 in shapes:
+            shapes[0] = self._without_neighbours(shapes[0])[0]
         objects: dict[int, list[VoxelGrid]] = {}
         for n, (grid, _) in shapes.items():
             told = [one for found in objects.values() for one in found]
@@ -547,6 +570,17 @@ class Reconstruction:
                 shapes[n] = usable[n].beside(shapes[n], others[n])
             shapes[n] = usable[n].given_back(shapes[n], others[n])
         return shapes
+
+    def _without_neighbours(
+        self, told: tuple[VoxelGrid, VoxelGrid | None]
+    ) -> tuple[tuple[VoxelGrid, VoxelGrid | None], VoxelGrid | None]:
+        """Leave of the target's grid the one body that it is for; return the rest too, if there is any."""
+        body = self.bodies[0]
+        cell = float(np.median([info.resolution_m[1] for info in body.infos.values()]))
+        given = math.isnan(body.target.evidence)
+        place = body.target.position_m if given else None
+        grid, rest = without_neighbours(told[0], APART_CELLS * cell, place)
+        return (grid, told[1]), rest
 
     @staticmethod
     def _add_objects(result: Result, body: Body, whole: VoxelGrid | None) -> None:
@@ -561,16 +595,33 @@ class Reconstruction:
         found, left_out = objects_of(whole, place, [o.grid for o in result.objects])
         result.left_out += left_out
         for grid in found:
-            # Silhouettes are those of the whole body: they measure a piece only where it is all of it.
-            alone = grid is whole
-            sides = _over_seabed(grid, body.known_sides()) if alone else []
-            mesh, dimensions = _measured(grid, sides, final=True)
-            target, box = body.target, grid.volume
-            if not alone:
-                target = Target((box.centre_m[0], box.centre_m[1]), box.size_m)
+            if grid is not whole:
+                _add_piece(result, grid, body)
+                continue
+            mesh, dimensions = _measured(grid, _over_seabed(grid, body.known_sides()), final=True)
             if mesh is not None and dimensions is not None:
                 views = len(body.carver.stamps)
-                result.further.append(ObjectResult(target, grid, mesh, dimensions, views))
+                result.further.append(ObjectResult(body.target, grid, mesh, dimensions, views))
+
+    def _add_neighbours(self, result: Result, rest: VoxelGrid | None) -> None:
+        """Add what was carved in the target's volume, is not of it, and was not reported for another body."""
+        body = self.bodies[0]
+        # A place that was given asks for one body.
+        if rest is None or math.isnan(body.target.evidence):
+            return
+        found, left_out = objects_of(rest, body.target.position_m, [o.grid for o in result.objects])
+        result.left_out += left_out
+        for grid in found:
+            _add_piece(result, grid, body)
+
+
+def _add_piece(result: Result, grid: VoxelGrid, body: Body) -> None:
+    """Add a piece of what was carved in a body's volume; the silhouettes, of the whole, tell it no sides."""
+    mesh, dimensions = _measured(grid, (), final=True)
+    box = grid.volume
+    target = Target((box.centre_m[0], box.centre_m[1]), box.size_m)
+    if mesh is not None and dimensions is not None:
+        result.further.append(ObjectResult(target, grid, mesh, dimensions, len(body.carver.stamps)))
 
 
 def _timed(result: Result, step: str, work: Callable[..., Any], *args: Any) -> Any:

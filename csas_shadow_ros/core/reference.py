@@ -138,7 +138,8 @@ def silhouette(
     """Segment the target's shadow (section 4.1, figure 7), by the package's rule instead of by hand.
 
     The shadow is every dark patch that begins at the target. Echoes are not known, as they lie over what
-    they hide. What lies between the target's echo and its shadow is covered.
+    they hide, nor is what is too dark for seabed beside thin shadow. What lies between the target's echo and
+    its shadow is covered.
 
     Parameters
     ----------
@@ -161,6 +162,7 @@ def silhouette(
     shadow = shadow_patches(dark_pixels(view, sigma_r, sigma_s), view.info, target_m, reach_m)
     echo = echo_pixels(view, sigma_r, echo_db)
     covered = covered_pixels(shadow, echo, view.info, target_m, reach_m)
+    unsure = unsure_pixels(view, sigma_r, sigma_s, shadow)
     rows, cols = view.info.camera.shape
     mask = np.empty((rows, cols), np.uint8)
     for v in range(rows):
@@ -169,9 +171,68 @@ def silhouette(
                 mask[v, u] = SHADOW
             elif echo[v, u] or not math.isfinite(view.pixels[v, u]):
                 mask[v, u] = UNKNOWN
+            elif covered[v, u]:
+                mask[v, u] = COVERED
             else:
-                mask[v, u] = COVERED if covered[v, u] else OUTSIDE
+                mask[v, u] = UNKNOWN if unsure[v, u] else OUTSIDE
     return mask
+
+
+def thin_shadow(shadow: NDArray[np.bool_], info: ViewInfo) -> NDArray[np.bool_]:
+    """Mark the shadow that no box of shadow comes near, three times that of `dark_pixels` in size.
+
+    Near is within 1.5 resolution cells, down-range and across.
+    """
+    rows, cols = shadow.shape
+    per_cell = tuple(c / p for c, p in zip(info.resolution_m, info.camera.spacing_m, strict=True))
+    down, across = round(3.0 * 1.8 * per_cell[0]), round(3.0 * 0.75 * per_cell[1])
+    near_down, near_across = down + round(1.5 * per_cell[0]), across + round(1.5 * per_cell[1])
+    thin = shadow.copy()
+    for v in range(rows):
+        for u in range(cols):
+            if shadow[max(0, v - down) : v + down + 1, max(0, u - across) : u + across + 1].all():
+                # From its middle, the box reaches so far, and what is near it farther.
+                thin[
+                    max(0, v - near_down) : v + near_down + 1, max(0, u - near_across) : u + near_across + 1
+                ] = False
+    return thin
+
+
+def unsure_pixels(
+    view: View, sigma_r: float, sigma_s: float, shadow: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Mark the pixels beside thin shadow that are too dark for seabed.
+
+    Dark is here where the mean power is less than half of the way from the shadow's to the seabed's, over 0.9
+    resolution cells down-range and 0.4 across, to either side; beside is within 4 cells either way.
+
+    Parameters
+    ----------
+    view : View
+        Amplitude, shape (rows, cols); NaN where unknown.
+    sigma_r, sigma_s : float
+        Rayleigh modes of seabed and shadow, in the amplitude's unit.
+    shadow : ndarray of bool, shape (rows, cols)
+        The target's shadow.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+    """
+    amplitude = view.pixels.astype(np.float64)
+    thin = thin_shadow(shadow, view.info)
+    half = box_px((0.9, 0.4), view.info)
+    cell_m, pixel_m = view.info.resolution_m, view.info.camera.spacing_m
+    down, across = (math.ceil(4.0 * cell / pixel) for cell, pixel in zip(cell_m, pixel_m, strict=True))
+    threshold = 2 * sigma_s**2 + 0.5 * (2 * sigma_r**2 - 2 * sigma_s**2)
+    rows, cols = amplitude.shape
+    unsure = np.zeros((rows, cols), bool)
+    for v in range(rows):
+        for u in range(cols):
+            near = thin[max(0, v - down) : v + down + 1, max(0, u - across) : u + across + 1]
+            if near.any() and math.isfinite(amplitude[v, u]):
+                unsure[v, u] = mean_power(amplitude, v, u, half) < threshold
+    return unsure
 
 
 def mean_power(amplitude: NDArray[np.float64], v: int, u: int, half: tuple[int, int]) -> float:

@@ -106,6 +106,8 @@ def test_a_shadow_has_an_end_only_where_seabed_is_seen_behind_it():
     assert found is not None
     pixel = info.camera.ground_to_pixel @ np.array([*found.point_m, 1.0])
     assert pixel[:2] == pytest.approx((15.0, 39.5))
+    mask[40:44] = MASK_UNKNOWN  # an echo, or too dark for seabed: seabed comes after it
+    assert shadow_end(View(info, mask)) == found
     mask[40:] = MASK_UNKNOWN
     assert shadow_end(View(info, mask)) is None
     mask[40:] = MASK_SHADOW
@@ -156,7 +158,7 @@ def test_a_run_over_a_slope_is_carved_as_over_a_level(level_and_tilted):
     leaning = carver.first_look().occupied
     assert agreement > 0.93
     assert agreement > (a & leaning).sum() / (a | leaning).sum() + 0.03
-    assert tilted.dimensions.height_m == pytest.approx(level.dimensions.height_m, abs=0.02)
+    assert tilted.dimensions.height_m == pytest.approx(level.dimensions.height_m, abs=0.025)
     # What is measured beside the grid stands over the same seabed.
     heights = [side.info.camera.sonar_m[2] for side in tilted.sides]
     told = [mask.info.camera.sonar_m[2] for mask in masks]

@@ -19,6 +19,7 @@ from ..geometry import View, ViewInfo
 from ..kernels import kernel
 from ..parameters import LikelihoodParameters
 from .likelihood import Levels, view_levels
+from .local_means import LocalMeans
 from .mask_codes import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from .masks import beside_px, flank_px
 
@@ -29,6 +30,17 @@ _DARK = 0.37
 #: The box's half-size in resolution cells, down-range and across. A shadow is several times as long as
 #: the target is high: down-range, averaging costs little resolution in height.
 _HALF_CELLS = (1.8, 0.75)
+#: That box is too coarse for shadow that is thinner than so many of it, either way, or that juts out so far
+#: of what is not (resolution cells, down-range and across). On 34 bodies of the population's development half
+#: and 38 of ten tapering families beside it, the mean IoU with the hull is 0.774 so (0.756 without), 0.768
+#: for two boxes; without the distinction it is 0.775, and boxes lose 0.03, as speckle is dark beside flat
+#: sides too.
+_THIN_BOXES, _JUTS_CELLS = 3.0, 1.5
+#: Around thin shadow, so far (resolution cells), nothing is said of what is dark in a box of half its size:
+#: nearer to the shadow's level than to the seabed's.
+_UNSURE_AROUND_CELLS = 4.0
+_UNSURE_HALF_CELLS = (0.9, 0.4)
+_UNSURE_DARK = 0.5
 #: How far around the target is looked at first (pixels), and how much farther down-range, where shadows lie:
 #: patches that lead out of it are followed.
 _MARGIN_PX = 16
@@ -95,8 +107,9 @@ def segment_shadow(
     Returns
     -------
     View
-        uint8: 255 target's shadow, 0 outside, 128 where the view knows nothing (off the image, and in an
-        echo), 64 between the target's echo and its shadow: the target covers it, or is open below.
+        uint8: 255 target's shadow, 0 outside, 128 where the view knows nothing (off the image, in an echo,
+        and beside thin shadow where it is too dark for seabed),
+        64 between the target's echo and its shadow: the target covers it, or is open below.
 
     Raises
     ------
@@ -122,7 +135,41 @@ def segment_shadow(
             echoes = echo[rows, before : cols.stop + beside]
             _before_shadow(shadow, echoes, left - before, view.info, near_end - begin, covered)
         _add_shadow(shadow, covered, mask[rows, cols])
+        _leave_open(levels, mask, rows, cols)
     return replace(view, pixels=mask)
+
+
+def _leave_open(levels: Levels, mask: NDArray[np.uint8], rows: slice, cols: slice) -> None:
+    """Let pixels beside thin shadow that are too dark for seabed say nothing.
+
+    The shadow thins out towards the end of a body that tapers, and single views lose it there, each at
+    another place. Carving would keep what all of them show: less than any of them.
+    """
+    local = levels.local
+    down, across = (math.ceil(_UNSURE_AROUND_CELLS * px) for px in local.cell_px)
+    where = (
+        slice(max(0, rows.start - down), min(mask.shape[0], rows.stop + down)),
+        slice(max(0, cols.start - across), min(mask.shape[1], cols.stop + across)),
+    )
+    part = mask[where]
+    shadow = (part == MASK_SHADOW).view(np.uint8)
+    wide = cv2.morphologyEx(shadow, cv2.MORPH_OPEN, _box(local, _THIN_BOXES, _HALF_CELLS))
+    thin = shadow & (cv2.dilate(wide, _box(local, _JUTS_CELLS)) == 0)
+    if not thin.any():
+        return
+    near = cv2.dilate(thin, np.ones((2 * down + 1, 2 * across + 1), np.uint8))
+    shadow_power = 1.0 / levels.contrast**2
+    threshold = shadow_power + _UNSURE_DARK * (1.0 - shadow_power)
+    dark = local.under(_UNSURE_HALF_CELLS, threshold, *where)
+    part[(part == MASK_OUTSIDE) & dark & near.view(np.bool_)] = MASK_UNKNOWN
+
+
+def _box(
+    local: LocalMeans, times: float, half_cells: tuple[float, float] = (1.0, 1.0)
+) -> NDArray[np.uint8]:
+    """Return a box of so many times a half-size (resolution cells) to either side, all ones."""
+    down, across = (round(times * half * px) for half, px in zip(half_cells, local.cell_px, strict=True))
+    return np.ones((2 * down + 1, 2 * across + 1), np.uint8)
 
 
 def _near_end(info: ViewInfo, target_m: tuple[float, float], reach_m: float) -> int:

@@ -6,7 +6,9 @@ body that reaches into its volume, or nothing once it is looked at sharply. What
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import scipy.ndimage
@@ -25,6 +27,9 @@ NOTHING_LEFT = "no voxel of its volume lies in shadow from all sides"
 _SAME_BODY = 0.25
 #: Voxels round one of several pieces that were carved in one volume.
 _MARGIN_VOXELS = 3
+#: Pieces whose plans lie farther apart than this (cross-range cells) are different bodies: as far as a side
+#: that stands out of a body belongs to something else (`measurement._FOREIGN_CELLS`).
+APART_CELLS = 3.0
 
 
 def nothing_left(place_m: tuple[float, float]) -> LeftOut:
@@ -47,6 +52,51 @@ def connected_pieces(occupied: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
     labels, count = scipy.ndimage.label(occupied, np.ones((3, 3, 3), bool))
     sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
     return [np.asarray(labels == 1 + i) for i in np.argsort(-sizes, kind="stable")]
+
+
+def without_neighbours(
+    grid: VoxelGrid, apart_m: float, place_m: tuple[float, float] | None = None
+) -> tuple[VoxelGrid, VoxelGrid | None]:
+    """Tell the body that a volume was carved for from others in it.
+
+    The search may take neighbours for one body. Carved, they stand apart.
+
+    Parameters
+    ----------
+    grid : VoxelGrid
+        Carved round the body.
+    apart_m : float
+        Pieces whose plans lie farther apart than this are different bodies, m.
+    place_m : (float, float), optional
+        Where the body is; by default it is the one with most voxels.
+
+    Returns
+    -------
+    own : VoxelGrid
+        `grid` itself where it holds one body.
+    others : VoxelGrid or None
+        The same lattice with what is not of the body.
+    """
+    plan = grid.occupied.any(axis=0)
+    if not plan.any():
+        return grid, None
+    reach = apart_m / 2.0 / grid.volume.voxel_size_m
+    margin = 1 + math.ceil(reach)
+    grown = scipy.ndimage.distance_transform_edt(~np.pad(plan, margin)) <= reach
+    labels, count = scipy.ndimage.label(grown, np.ones((3, 3), bool))
+    body = labels[margin:-margin, margin:-margin]
+    sizes = np.bincount(body.ravel(), grid.occupied.sum(axis=0).ravel(), minlength=count + 1)
+    if count == 1:
+        return grid, None
+    kept = int(sizes[1:].argmax()) + 1
+    if place_m is not None:
+        j, i = np.nonzero(plan & (sizes[body] >= LEAST_VOXELS))
+        if len(j):
+            away = np.hypot(grid.volume.x_m[i] - place_m[0], grid.volume.y_m[j] - place_m[1])
+            nearest = int(away.argmin())
+            kept = int(body[j[nearest], i[nearest]])
+    own = grid.occupied & (body == kept)
+    return replace(grid, occupied=own), replace(grid, occupied=grid.occupied & ~own)
 
 
 def overlap_share(a: VoxelGrid, b: VoxelGrid) -> float:

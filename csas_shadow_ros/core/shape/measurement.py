@@ -34,8 +34,9 @@ from ..imaging.likelihood import Levels
 from ..imaging.local_means import LocalMeans
 from ..imaging.mask_codes import MASK_SHADOW, MASK_UNKNOWN
 from .contour import Contour, contour_height, contour_of
+from .echo_sides import echo_reach_px
 from .mesh import Dimensions, digits_of, measure
-from .seabed import largest_piece
+from .seabed import largest_piece, leaves_image
 from .volume import VoxelGrid
 
 if TYPE_CHECKING:
@@ -77,6 +78,11 @@ _FINE_DIRECTIONS = 720
 #: the seabed is out of focus where the shadow is in focus, as light is behind a knife's edge. Measured on the
 #: simulated box and frame: 0.1 to 0.25.
 _OUTSIDE_CELLS = 0.15
+#: The target's own echo is seen so much farther out than its plan reaches: 1.0 to 1.4 cells for flat walls
+#: seen along, whose looks and response spread it, 0 for slopes. And it tells a side if most of the views
+#: beside see it so much farther out still than their shadows end, in their median (cross-range cells).
+#: Without the former boxes, crates and poles with bright walls come out 1 to 2 cells too wide.
+_ECHO_SPREAD_CELLS, _ECHO_BEYOND_CELLS = 0.75, 0.75
 #: The carved voxels stand in for sides that no view shows; beside an edge that is seen they count so much.
 _VOXEL_WEIGHT = 0.1
 #: A side that stands out of the carved voxels by more than this (cross-range cells) belongs to something else
@@ -146,6 +152,8 @@ class SilhouetteSides:
     contour : Contour, optional
         Where the last rays over the target leave it; None where the silhouette holds the target's echo too,
         as one that is drawn by hand.
+    echo_support_m : tuple of float
+        The support of each side as the target's own echo tells it, m; NaN where none is seen.
     """
 
     info: ViewInfo
@@ -156,6 +164,7 @@ class SilhouetteSides:
     support_by_shape_m: tuple[tuple[float, ...], ...] = ()
     cut: bool = False
     contour: Contour | None = None
+    echo_support_m: tuple[float, ...] = ()
 
 
 def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) -> SilhouetteSides | None:
@@ -191,7 +200,8 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
     last = cols - 1 - shadow[rows][:, ::-1].argmax(axis=1).astype(np.float64)
     outside = _OUTSIDE_CELLS * info.resolution_m[1] if math.isfinite(info.focus_range_m) else 0.0
     e_c = cross_range_axis(info.aspect_rad)
-    directions, supports, shapes = [], [], []
+    directions, supports, shapes, echoes = [], [], [], []
+    reach_px = echo_reach_px(levels, mask, shadow, (u0, v0))
     for sign, edge in ((1, last), (-1, first)):
         found = _side(levels, rows, sign * (edge - u0) * scale, scale, sign, (u0, v0), info.cell_px)
         if found is None:
@@ -203,13 +213,21 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
         beyond = {"straight": outside, "flared": outside}
         supports.append(tuple(out[name] * col_m - beyond.get(name, 0.0) + here for name in SHAPES))
         shapes.append(shape)
+        echoes.append(reach_px[0 if sign > 0 else 1] * col_m + here)
     tip = info.down_range_of_rows()[rows[-1]] + row_m / 2.0
     own = tuple(each[SHAPES.index(shape)] for each, shape in zip(supports, shapes, strict=True))
-    beyond_tip = rows[-1] + 1
-    cut = beyond_tip == len(shadow) or not levels.known[beyond_tip, shadow[rows[-1]]].all()
+    cut = leaves_image(levels.known, shadow, int(rows[-1]))
     contour = None if math.isnan(levels.seabed_level) else contour_of(shadow, info)
     return SilhouetteSides(
-        info, tuple(directions), own, float(tip), tuple(shapes), tuple(supports), bool(cut), contour
+        info,
+        tuple(directions),
+        own,
+        float(tip),
+        tuple(shapes),
+        tuple(supports),
+        cut,
+        contour,
+        tuple(echoes),
     )
 
 
@@ -344,7 +362,26 @@ def _agreed_support(sides: Sequence[SilhouetteSides]) -> FloatArray:
         stands_out = float(np.median(told_beside)) if len(told_beside) else 0.0
         if stands_out > _FLARE_CELLS * cell_m[index]:
             agreed[index] += stands_out
-    return np.where(np.isnan(agreed), own, agreed)
+    return _with_echoes(np.where(np.isnan(agreed), own, agreed), sides, beside, cell_m)
+
+
+def _with_echoes(
+    supports: FloatArray, sides: Sequence[SilhouetteSides], beside: NDArray[np.bool_], cell_m: FloatArray
+) -> FloatArray:
+    """Move sides out to where the target's own echo ends, if most views beside see it clearly farther out.
+
+    A low flank shines where its shadow is too short to be seen.
+    """
+    echo = np.array([each for side in sides for each in side.echo_support_m])
+    if len(echo) != len(supports):
+        return supports
+    out = supports.copy()
+    for index, row in enumerate(beside):
+        told = np.where(np.isnan(echo[row]), -math.inf, echo[row])  # no echo: it reaches nowhere
+        reach = float(np.median(told)) - _ECHO_SPREAD_CELLS * cell_m[index]
+        if reach > supports[index] + _ECHO_BEYOND_CELLS * cell_m[index]:
+            out[index] = reach
+    return out
 
 
 class PlanFit:
@@ -746,6 +783,38 @@ def measure_object(
     return replace(measured, height_m=height, intervals=intervals, scatter_cells=fit.spread_m / across)
 
 
+def doubted(found: Dimensions, share: float) -> Dimensions:
+    """Widen the intervals of an object that does not explain its shadows.
+
+    Parameters
+    ----------
+    found : Dimensions
+        Its measures.
+    share : float
+        Share of the shadow that it leaves unexplained, and of its own that is lit in the views.
+
+    Notes
+    -----
+    Resampling the views shows what is random. Shadow that the object does not cast may be that of a part that
+    it lacks, and each measure so much larger; shadow that is lit in the views, that of a part that is not
+    there.
+
+    Examples
+    --------
+    >>> box = Dimensions(1.0, 0.5, 0.2, 0.1, 0.0, (0.0, 0.0), intervals={"length_m": (0.9, 1.1)})
+    >>> [round(float(end), 3) for end in doubted(box, 0.2).intervals["length_m"]]
+    [0.7, 1.3]
+    """
+    sizes = {name: getattr(found, name) for name in ("length_m", "width_m", "height_m", "volume_m3")}
+    more = {name: share * size for name, size in sizes.items()}
+    more |= dict.fromkeys(("position_x_m", "position_y_m"), share * found.length_m / 2.0)
+    intervals = {}
+    for name, (low, high) in found.intervals.items():
+        lower = low - more.get(name, 0.0)
+        intervals[name] = (max(0.0, lower) if name in sizes else lower, high + more.get(name, 0.0))
+    return replace(found, intervals=intervals)
+
+
 def _resampled(fit: PlanFit, sides: Sequence[SilhouetteSides], seed: int) -> list[_Rectangle]:
     """Fit the plan to views drawn again and again, in blocks of an aperture."""
     rng = np.random.default_rng(seed)
@@ -765,6 +834,7 @@ __all__ = [
     "PlanFit",
     "SilhouetteSides",
     "cap_of",
+    "doubted",
     "levels_of_mask",
     "measure_object",
     "shadow_height",

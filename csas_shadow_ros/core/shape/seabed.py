@@ -120,6 +120,22 @@ def largest_piece(shadow: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
     return piece
 
 
+def leaves_image(known: NDArray[np.bool_], shadow: NDArray[np.bool_], last: int) -> bool:
+    """Say whether a shadow may go on off the image.
+
+    Parameters
+    ----------
+    known : ndarray of bool, shape (rows, cols)
+        What the view knows. Off the image that is nothing any more; an echo, or what is too dark for seabed,
+        ends again.
+    shadow : ndarray of bool, shape (rows, cols)
+        The shadow.
+    last : int
+        Its last row.
+    """
+    return bool(last + 1 >= len(shadow) or not known[last + 1 :, shadow[last]].any(axis=0).all())
+
+
 def shadow_end(mask: View) -> ShadowEnd | None:
     """Find the far end of the target's shadow.
 
@@ -138,7 +154,7 @@ def shadow_end(mask: View) -> ShadowEnd | None:
         return None
     rows = np.flatnonzero(shadow.any(axis=1))
     last = int(rows[-1])
-    if last + 1 >= shadow.shape[0] or (mask.pixels[last + 1][shadow[last]] == _UNKNOWN).any():
+    if leaves_image(mask.pixels != _UNKNOWN, shadow, last):
         return None
     end_rows = max(1, round(_END_CELLS * mask.info.cell_px[0]))
     columns = np.nonzero(shadow[max(int(rows[0]), last + 1 - end_rows) : last + 1])[1]
