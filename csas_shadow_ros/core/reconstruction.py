@@ -609,7 +609,8 @@ class Reconstruction:
         # A place that was given asks for one body.
         if rest is None or math.isnan(body.target.evidence):
             return
-        found, left_out = objects_of(rest, body.target.position_m, [o.grid for o in result.objects])
+        reported = [one.grid for one in result.objects]
+        found, left_out = objects_of(rest, body.target.position_m, reported, cut=True)
         result.left_out += left_out
         for grid in found:
             _add_piece(result, grid, body)

@@ -14,7 +14,7 @@ from csas_shadow_ros.core.imaging.mask_codes import MASK_OUTSIDE, MASK_SHADOW, M
 from csas_shadow_ros.core.imaging.segmentation import segment_shadow
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.pipeline import run
-from csas_shadow_ros.core.search.pieces import without_neighbours
+from csas_shadow_ros.core.search.pieces import objects_of, without_neighbours
 from csas_shadow_ros.core.shape import measurement
 from csas_shadow_ros.core.shape.echo_sides import echo_reach_px
 from csas_shadow_ros.core.shape.measurement import doubted
@@ -138,3 +138,6 @@ def test_neighbours_in_one_volume_are_told_apart_and_a_body_with_a_gap_is_not():
     pointed, _ = without_neighbours(grid, 0.3, (1.2, 0.0))
     np.testing.assert_array_equal(pointed.occupied, rest.occupied)
     assert without_neighbours(own, 0.3) == (own, None)
+    ((neighbour,), nothing) = objects_of(rest, (0.0, 0.0), [own], cut=True)
+    assert nothing == []
+    assert neighbour.volume.centre_m[0] == pytest.approx(1.25, abs=0.05)

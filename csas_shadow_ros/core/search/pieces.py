@@ -125,7 +125,7 @@ def overlap_share(a: VoxelGrid, b: VoxelGrid) -> float:
 
 
 def objects_of(
-    grid: VoxelGrid, place_m: tuple[float, float], reported: Sequence[VoxelGrid]
+    grid: VoxelGrid, place_m: tuple[float, float], reported: Sequence[VoxelGrid], *, cut: bool = False
 ) -> tuple[list[VoxelGrid], list[LeftOut]]:
     """List the objects in a body's carved volume that were not reported before.
 
@@ -137,6 +137,8 @@ def objects_of(
         Where the search found it.
     reported : sequence of VoxelGrid
         Grids of the objects found so far, in that order.
+    cut : bool
+        Cut `grid` down to its piece also where it holds one alone.
 
     Returns
     -------
@@ -151,7 +153,7 @@ def objects_of(
     objects: list[VoxelGrid] = []
     left_out = []
     for piece in pieces:
-        one = _only(grid, piece, whole=len(pieces) == 1)
+        one = _only(grid, piece, whole=len(pieces) == 1 and not cut)
         if reason := _why_no_object(grid, piece, [*reported, *objects]):
             left_out.append(LeftOut(_middle(one), reason))
         else:
