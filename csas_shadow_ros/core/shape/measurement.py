@@ -95,7 +95,7 @@ _MIN_EDGES = 24
 #: measured vehicle, which were cut out one by one (docs/examples.md), by 1.5.
 _ONE_PLAN_CELLS = 1.0
 #: Parts of a plan that are thinner than this are not measured where the sides scatter so (cross-range cells).
-#: The measured vehicle of docs/examples.md is 7.77 m long with its crumbs and 6.99 m without (its hull has
+#: The measured vehicle of docs/examples.md is 7.74 m long with its crumbs and 6.96 m without (its hull has
 #: 6.95 m); at half 7.02 m, at double 6.76 m.
 _THIN_CELLS = 2.0
 #: Resamplings of the views.
@@ -345,9 +345,7 @@ def _agreed_support(sides: Sequence[SilhouetteSides]) -> FloatArray:
         return own  # of a program that does not tell shapes
     shape = np.array([SHAPES.index(name) for name in told], dtype=np.intp)
     by_shape = np.array([each for side in sides for each in side.support_by_shape_m]).reshape(-1, len(SHAPES))
-    phi = np.array([angle for side in sides for angle in side.direction_rad])
-    half = np.array([side.info.aperture_rad / 2.0 for side in sides for _ in side.direction_rad])
-    beside = np.abs(np.mod(phi[:, None] - phi[None, :] + math.pi, TWO_PI) - math.pi) <= half[:, None] + 1e-9
+    beside = _beside(sides)
     ballots = np.eye(len(SHAPES))[shape]
     votes = beside.astype(np.float64) @ ballots
     votes += _ALL_SIDES * votes.sum(axis=1, keepdims=True) * ballots.mean(axis=0)
@@ -362,12 +360,18 @@ def _agreed_support(sides: Sequence[SilhouetteSides]) -> FloatArray:
         stands_out = float(np.median(told_beside)) if len(told_beside) else 0.0
         if stands_out > _FLARE_CELLS * cell_m[index]:
             agreed[index] += stands_out
-    return _with_echoes(np.where(np.isnan(agreed), own, agreed), sides, beside, cell_m)
+    return np.where(np.isnan(agreed), own, agreed)
 
 
-def _with_echoes(
-    supports: FloatArray, sides: Sequence[SilhouetteSides], beside: NDArray[np.bool_], cell_m: FloatArray
-) -> FloatArray:
+def _beside(sides: Sequence[SilhouetteSides]) -> NDArray[np.bool_]:
+    """Say which sides look at the same side of the target: within half an aperture of one another."""
+    phi = np.array([angle for side in sides for angle in side.direction_rad])
+    half = np.array([side.info.aperture_rad / 2.0 for side in sides for _ in side.direction_rad])
+    away = np.abs(np.mod(phi[:, None] - phi[None, :] + math.pi, TWO_PI) - math.pi)
+    return np.asarray(away <= half[:, None] + 1e-9)
+
+
+def _with_echoes(supports: FloatArray, sides: Sequence[SilhouetteSides]) -> FloatArray:
     """Move sides out to where the target's own echo ends, if most views beside see it clearly farther out.
 
     A low flank shines where its shadow is too short to be seen.
@@ -375,8 +379,9 @@ def _with_echoes(
     echo = np.array([each for side in sides for each in side.echo_support_m])
     if len(echo) != len(supports):
         return supports
+    cell_m = np.array([side.info.resolution_m[1] for side in sides for _ in side.direction_rad])
     out = supports.copy()
-    for index, row in enumerate(beside):
+    for index, row in enumerate(_beside(sides)):
         told = np.where(np.isnan(echo[row]), -math.inf, echo[row])  # no echo: it reaches nowhere
         reach = float(np.median(told)) - _ECHO_SPREAD_CELLS * cell_m[index]
         if reach > supports[index] + _ECHO_BEYOND_CELLS * cell_m[index]:
@@ -396,6 +401,8 @@ class PlanFit:
         Of all views.
     grid : VoxelGrid
         Carved voxels, which stand in where no side is seen.
+    support_m : ndarray of float, optional
+        The plan's support in the direction of each side, m; by default as shadows tell it.
 
     Attributes
     ----------
@@ -407,7 +414,9 @@ class PlanFit:
         Directions (rad) that `solve` answers for.
     """
 
-    def __init__(self, sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> None:
+    def __init__(
+        self, sides: Sequence[SilhouetteSides], grid: VoxelGrid, support_m: FloatArray | None = None
+    ) -> None:
         pairs = [
             (phi, math.nan, side.info.aperture_rad, index)
             for index, side in enumerate(sides)
@@ -416,7 +425,8 @@ class PlanFit:
         seen: FloatArray = np.array(pairs, dtype=np.float64).reshape(-1, 4)
         # The fit makes 1e-4 m of the FFT's rounding, 1e-9 m: to a hundredth of a voxel the same image leaves
         # the same sides, whether it came whole or as a sum of sectors. Edges are ten times less sure.
-        seen[:, 1] = np.round(_agreed_support(sides), digits_of(grid.volume.voxel_size_m))
+        told = _agreed_support(sides) if support_m is None else support_m
+        seen[:, 1] = np.round(told, digits_of(grid.volume.voxel_size_m))
         self.directions: FloatArray = _round_circle(_FINE_DIRECTIONS)
         coarse = _round_circle(_DIRECTIONS)
         own = _voxel_support(grid, coarse)
@@ -727,16 +737,24 @@ def measure_object(
     """
     whole = measure(mesh)
     sides = sorted(sides, key=lambda side: side.info.stamp_ns)
-    fit = PlanFit(sides, grid)
+    by_shadows = _agreed_support(sides)
+    fit = PlanFit(sides, grid, by_shadows)
     if fit.count < _MIN_EDGES:
         return whole
-    plan = _rectangle(fit.solve(), fit.centre)
+    support = fit.solve()
+    # Shadows alone tell whether there is one plan: echoes would hide that they do not agree.
+    spread_m = fit.spread_m
+    by_echoes = _with_echoes(by_shadows, sides)
+    if (by_echoes != by_shadows).any():
+        fit = PlanFit(sides, grid, by_echoes)
+        support = fit.solve()
+    plan = _rectangle(support, fit.centre)
     grazing = float(np.median([side.info.camera.grazing_rad for side in sides]))
     resampled = _resampled(fit, sides, seed)
     down, across = (float(np.median([s.info.resolution_m[axis] for s in sides])) for axis in (0, 1))
     edge = _EDGE_CELLS * across
     d = grid.volume.voxel_size_m
-    if fit.spread_m > _ONE_PLAN_CELLS * across:
+    if spread_m > _ONE_PLAN_CELLS * across:
         # No one plan has these sides, as where each view lies at a place of its own: the voxels, which a few
         # views do not move, are what all agree on.
         solid = _without_thin_parts(grid, _THIN_CELLS * across)
@@ -780,7 +798,7 @@ def measure_object(
     # A surface that lies wrong by one error everywhere.
     change = float(mesh.area) * math.hypot(edge / 2.0, d / 4.0)
     intervals["volume_m3"] = (max(0.0, whole.volume_m3 - change), whole.volume_m3 + change)
-    return replace(measured, height_m=height, intervals=intervals, scatter_cells=fit.spread_m / across)
+    return replace(measured, height_m=height, intervals=intervals, scatter_cells=spread_m / across)
 
 
 def doubted(found: Dimensions, share: float) -> Dimensions:
