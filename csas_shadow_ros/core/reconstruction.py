@@ -182,9 +182,12 @@ class Body:
     def given_back(
         self, carved: tuple[VoxelGrid, VoxelGrid | None], others: Sequence[VoxelGrid]
     ) -> tuple[VoxelGrid, VoxelGrid | None]:
-        """Return what was carved with what only lit pixels on its own plan took (`Carver.given_back`)."""
+        """Return what was carved with what only lit pixels on its own plan took (`Carver.given_back`).
+
+        Where that still leaves most of its shadow unexplained, the mean likelihood tells what is there.
+        """
         own, other = self._own_first(carved)
-        return self._told(self.carver.given_back(own, others), other)
+        return self._told(self.carver.given_back(own, others), other, others)
 
     def _own_first(
         self, told: tuple[VoxelGrid, VoxelGrid | None]
@@ -194,11 +197,14 @@ class Body:
             return other, grid
         return grid, other
 
-    def _told(self, own: VoxelGrid, other: VoxelGrid | None) -> tuple[VoxelGrid, VoxelGrid | None]:
-        silhouettes = self.carver.parameters.takes_masks
-        if silhouettes and other is not None and other.occupied.any() and not own.occupied.any():
-            return other, own
-        return own, other
+    def _told(
+        self, own: VoxelGrid, other: VoxelGrid | None, others: Sequence[VoxelGrid] | None = None
+    ) -> tuple[VoxelGrid, VoxelGrid | None]:
+        """Put the grid first that tells the body; once the other bodies are known, by what both explain."""
+        if not self.carver.parameters.takes_masks or other is None or not other.occupied.any():
+            return own, other
+        lost = not own.occupied.any() if others is None else self.carver.lost(own, other, others)
+        return (other, own) if lost else (own, other)
 
     def shadow_fits(self, grids: Sequence[VoxelGrid]) -> dict[int, ShadowFit]:
         """Compare the silhouettes with bodies' shadows, its own first, by stamp, whatever carved them."""
