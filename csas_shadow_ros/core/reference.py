@@ -204,7 +204,7 @@ def unsure_pixels(
     """Mark the pixels beside thin shadow that are too dark for seabed.
 
     Dark is here where the mean power is less than half of the way from the shadow's to the seabed's, over 0.9
-    resolution cells down-range and 0.4 across, to either side; beside is within 4 cells either way.
+    resolution cells down-range and 0.4 across, to either side; beside is within a cell either way.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def unsure_pixels(
     thin = thin_shadow(shadow, view.info)
     half = box_px((0.9, 0.4), view.info)
     cell_m, pixel_m = view.info.resolution_m, view.info.camera.spacing_m
-    down, across = (math.ceil(4.0 * cell / pixel) for cell, pixel in zip(cell_m, pixel_m, strict=True))
+    down, across = (math.ceil(cell / pixel) for cell, pixel in zip(cell_m, pixel_m, strict=True))
     threshold = 2 * sigma_s**2 + 0.5 * (2 * sigma_r**2 - 2 * sigma_s**2)
     rows, cols = amplitude.shape
     unsure = np.zeros((rows, cols), bool)

@@ -216,7 +216,7 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
         echoes.append(reach_px[0 if sign > 0 else 1] * col_m + here)
     tip = info.down_range_of_rows()[rows[-1]] + row_m / 2.0
     own = tuple(each[SHAPES.index(shape)] for each, shape in zip(supports, shapes, strict=True))
-    cut = leaves_image(levels.known, shadow, int(rows[-1]))
+    cut = leaves_image(mask.pixels != MASK_UNKNOWN, shadow, int(rows[-1]))
     contour = None if math.isnan(levels.seabed_level) else contour_of(shadow, info)
     return SilhouetteSides(
         info,
@@ -759,21 +759,7 @@ def measure_object(
         # views do not move, are what all agree on.
         solid = _without_thin_parts(grid, _THIN_CELLS * across)
         plan = _rectangle(_voxel_support(solid, fit.directions), np.zeros(2))
-    intervals = {}
-    for name in ("length_m", "width_m"):
-        value = getattr(plan, name)
-        sigma = math.hypot(float(np.std([getattr(r, name) for r in resampled])), edge)
-        intervals[name] = (max(0.0, value - _SIGMAS_95 * sigma), value + _SIGMAS_95 * sigma)
-    for axis, name in enumerate(("position_x_m", "position_y_m")):
-        sigma = math.hypot(float(np.std([r.position_m[axis] for r in resampled])), edge / 2.0)
-        value = plan.position_m[axis]
-        intervals[name] = (value - _SIGMAS_95 * sigma, value + _SIGMAS_95 * sigma)
-    turns = [math.remainder(r.heading_rad - plan.heading_rad, math.pi) for r in resampled]
-    sigma = math.hypot(float(np.sqrt(np.mean(np.square(turns)))), edge / plan.length_m)
-    intervals["heading_rad"] = (
-        plan.heading_rad - _SIGMAS_95 * sigma,
-        plan.heading_rad + _SIGMAS_95 * sigma,
-    )
+    intervals = _plan_intervals(plan, resampled, edge)
     cap = cap_of(grid, grazing)
     sigma = math.hypot(d / 2.0, down * math.tan(grazing))
     measured = replace(
@@ -799,6 +785,26 @@ def measure_object(
     change = float(mesh.area) * math.hypot(edge / 2.0, d / 4.0)
     intervals["volume_m3"] = (max(0.0, whole.volume_m3 - change), whole.volume_m3 + change)
     return replace(measured, height_m=height, intervals=intervals, scatter_cells=spread_m / across)
+
+
+def _plan_intervals(
+    plan: _Rectangle, resampled: Sequence[_Rectangle], edge_m: float
+) -> dict[str, tuple[float, float]]:
+    """Return the 95 % intervals of a plan by its resamplings, and the error of an edge."""
+    intervals = {}
+    for name in ("length_m", "width_m"):
+        value = getattr(plan, name)
+        sigma = math.hypot(float(np.std([getattr(r, name) for r in resampled])), edge_m)
+        intervals[name] = (max(0.0, value - _SIGMAS_95 * sigma), value + _SIGMAS_95 * sigma)
+    for axis, name in enumerate(("position_x_m", "position_y_m")):
+        sigma = math.hypot(float(np.std([r.position_m[axis] for r in resampled])), edge_m / 2.0)
+        value = plan.position_m[axis]
+        intervals[name] = (value - _SIGMAS_95 * sigma, value + _SIGMAS_95 * sigma)
+    turns = [math.remainder(r.heading_rad - plan.heading_rad, math.pi) for r in resampled]
+    sigma = math.hypot(float(np.sqrt(np.mean(np.square(turns)))), edge_m / plan.length_m)
+    heading = plan.heading_rad
+    intervals["heading_rad"] = (heading - _SIGMAS_95 * sigma, heading + _SIGMAS_95 * sigma)
+    return intervals
 
 
 def doubted(found: Dimensions, share: float) -> Dimensions:
