@@ -30,7 +30,7 @@ from .parameters import PipelineParameters
 from .search.decision import Decision
 from .search.pieces import APART_CELLS, nothing_left, objects_of, without_neighbours
 from .shape.carving import Carver, compared_shadows
-from .shape.explained import ShadowFit
+from .shape.explained import ShadowFit, mean_fit
 from .shape.hollows import EchoLook, matter_mesh, matter_of
 from .shape.measurement import (
     SilhouetteSides,
@@ -234,12 +234,9 @@ def _measured(
 
 def _doubted(found: Dimensions, fits: Mapping[int, ShadowFit], grid: VoxelGrid) -> Dimensions:
     """Widen intervals by the shares of shadow that an object leaves unexplained, or casts on lit seabed."""
-    shares = [
-        float(np.mean(known))
-        for name in ("unexplained", "lit")
-        if (known := [share for fit in fits.values() if math.isfinite(share := getattr(fit, name))])
-    ]
-    return doubted(found, sum(shares)).rounded(grid.volume.voxel_size_m)
+    mean = mean_fit(fits.values())
+    share = float(np.nansum([mean.unexplained, mean.lit]))
+    return doubted(found, share).rounded(grid.volume.voxel_size_m)
 
 
 class Reconstruction:

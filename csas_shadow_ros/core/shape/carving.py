@@ -32,7 +32,7 @@ from ..kernels import kernel
 from ..methods import method_named
 from ..parameters import CarvingParameters
 from ..threads import in_order
-from .explained import ShadowFit, count_shadow_pixels, shadow_fit, unexplained_shadow
+from .explained import ShadowFit, count_shadow_pixels, mean_fit, shadow_fit, unexplained_shadow
 from .layover import echo_zone, opaque_part
 from .plan import echo_of_plan, on_plan, plan_of_sides, shadow_sides
 from .seabed import SeabedSlope, seabed_slope, shadow_end
@@ -635,8 +635,9 @@ class Carver:
         below = _columns_filled(body.occupied, whole.occupied) & ~body.occupied
         if np.count_nonzero(below) >= _UNDERCUT * count and self._mostly_under(_SELDOM, body, below):
             filled = self._with(body, whole, below)
-        if faces and sum(self.misfit([filled, *others])) - sum(left) >= _NET_EXPLAINED:
-            return whole
+        if faces and unexplained >= _EXPLAINED:
+            more = sum(self.misfit([filled, *others])) - sum(left)
+            return whole if more >= _NET_EXPLAINED else filled
         return filled
 
     @staticmethod
@@ -651,11 +652,8 @@ class Carver:
 
         NaN where no view tells.
         """
-        fits = self.shadow_fits(bodies).values()
-        shares = np.array([(fit.unexplained, fit.lit) for fit in fits]).reshape(-1, 2).T
-        known = [row[np.isfinite(row)] for row in shares]
-        unexplained, lit = (float(row.mean()) if len(row) else math.nan for row in known)
-        return unexplained, lit
+        mean = mean_fit(self.shadow_fits(bodies).values())
+        return mean.unexplained, mean.lit
 
     def lost(self, body: VoxelGrid, instead: VoxelGrid, others: Sequence[VoxelGrid] = ()) -> bool:
         """Say whether carving lost most of a body, and another grid of it explains its shadow better."""

@@ -8,7 +8,7 @@ those that darken them. Pixels that it darkens and that are lit say that it has 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -156,6 +156,13 @@ def shadow_fit(mask: View, grids: Sequence[VoxelGrid]) -> ShadowFit:
     lit = own & (mask.pixels == MASK_OUTSIDE) & ~_about(dark, mask)
     cast = np.logical_or.reduce([own, *others])
     return ShadowFit(_share(dark & ~_about(cast, mask), dark), _share(lit, own))
+
+
+def mean_fit(fits: Iterable[ShadowFit]) -> ShadowFit:
+    """Return the mean shares of those views that tell them; NaN where none does."""
+    shares = np.array([(fit.unexplained, fit.lit) for fit in fits]).reshape(-1, 2).T
+    known = [row[np.isfinite(row)] for row in shares]
+    return ShadowFit(*(float(row.mean()) if len(row) else math.nan for row in known))
 
 
 def _share(part: BoolArray, whole: BoolArray) -> float:
