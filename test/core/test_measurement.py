@@ -203,6 +203,20 @@ def test_the_carved_voxels_stand_in_where_an_arc_is_missing():
     assert widths(PlanFit(sides, grid_of(occupied))) == pytest.approx((0.6, 0.4), abs=0.02)
 
 
+@pytest.mark.parametrize("gap_deg", [30.0, 60.0])
+def test_sides_that_err_beside_a_gap_do_not_tell_what_lies_in_it(gap_deg):
+    # As where a neighbour's shadow touches this one's, seen along both.
+    exact = drawn_sides(box_support(0.6, 0.3), keep=lambda degrees: 0.5 * gap_deg < degrees % 180.0)
+    exact = [one for one in exact if math.degrees(one.info.aspect_rad) % 180.0 < 180.0 - 0.5 * gap_deg]
+    out = [
+        replace(one, support_m=tuple(s + 0.02 * abs(math.sin(p)) for s, p in zip(one.support_m, one.direction_rad)))
+        for one in exact
+    ]
+    z, y, x = np.meshgrid(VOLUME.z_m, VOLUME.y_m, VOLUME.x_m, indexing="ij")
+    occupied = (np.abs(x) < 0.3) & (np.abs(y) < 0.15) & (z < 0.2)
+    assert widths(PlanFit(out, grid_of(occupied)))[1] == pytest.approx(0.3, abs=0.03)
+
+
 def test_sides_of_something_else_do_not_count():
     sides = drawn_sides(box_support(0.6, 0.4))
     sides = [
@@ -281,6 +295,26 @@ def test_the_height_is_where_the_cap_begins(half_m):
     k, j, i = (int(index) for index in np.argwhere(occupied)[-1])
     occupied[k + 1, j, i] = True
     assert cap_of(grid_of(occupied), GRAZING).begins_m == pytest.approx(cap.begins_m, abs=1e-9)
+
+
+def test_a_tip_that_views_cut_each_at_its_height_is_as_high_as_half_of_them_say():
+    z, y, x = np.meshgrid(VOLUME.z_m, VOLUME.y_m, VOLUME.x_m, indexing="ij")
+    # A cone; of 90 views each keeps it up to a height of its own.
+    tops = 0.25 + 0.02 * np.random.default_rng(2).standard_normal(90)
+    share = np.mean([np.hypot(x, y) > 1.2 * (top - z) for top in tops], axis=0)
+    grid = VoxelGrid(
+        VOLUME, share.astype(np.float32), np.full(z.shape, 90, np.uint16), 0.03, np.asarray(share < 0.03)
+    )
+    cap = cap_of(grid, GRAZING)
+    assert cap.top_m < 0.25 - 0.02
+    assert cap.half_m == pytest.approx(0.25, abs=0.01)
+    measured = measure_object(grid, mesh_from_grid(grid), drawn_sides(lambda p: np.full_like(p, 0.28)))
+    assert measured.intervals["height_m"][1] > 0.25
+    # Where no view counts what is above, nothing is added.
+    flat = grid_of(share < 0.03)
+    assert cap_of(flat, GRAZING).half_m == pytest.approx(cap_of(flat, GRAZING).top_m, abs=VOLUME.voxel_size_m)
+    soft = replace(flat, method="soft", threshold=0.2)
+    assert cap_of(soft, GRAZING).half_m == cap_of(soft, GRAZING).top_m
 
 
 @pytest.mark.parametrize("radius_m", [0.25, 0.4, 0.6])

@@ -13,6 +13,7 @@ from core_data import HEIGHT_M, hidden_by_box, hidden_by_cylinder, hull_of, iou,
 
 from csas_shadow_ros.core.errors import GeometryError, ParameterError, ViewError
 from csas_shadow_ros.core.geometry import View
+from csas_shadow_ros.core.imaging.masks import KeptMask
 from csas_shadow_ros.core.parameters import CarvingParameters
 from csas_shadow_ros.core.shape.carving import Carver, carve
 from csas_shadow_ros.core.shape.threshold import object_threshold, occupied_voxels, supported
@@ -366,6 +367,55 @@ def test_each_voxel_counts_what_a_bilinear_look_at_its_own_pixel_says(size):
     known = (count > 0) & (grid.views == count)
     assert np.abs(grid.likelihood - total / np.maximum(count, 1))[known].max() < 1e-3
     assert np.isnan(grid.likelihood[grid.views == 0]).all()
+
+
+@pytest.mark.parametrize("part", [slice(20, 40), slice(0, 96), slice(95, 96), slice(0, 0)])
+def test_a_changed_mask_leaves_the_grid_that_it_alone_would_leave(part):
+    rng = np.random.default_rng(3)
+    before = [View(one.info, one.pixels.copy()) for one in patchy_masks(96)]
+    changed = Carver(VOLUME)
+    for view in before:
+        view.pixels[rng.random((96, 96)) < 0.1] = 64  # covered
+        changed.integrate(view)
+    after = {}
+    for view in before[::2]:
+        pixels = view.pixels.copy()
+        pixels[part, 10:60] = rng.choice(np.array([0, 64, 128, 255], np.uint8), pixels[part, 10:60].shape)
+        after[view.info.stamp_ns] = View(view.info, pixels)
+    again = changed._again(
+        lambda kept: KeptMask.of(after[kept.info.stamp_ns]) if kept.info.stamp_ns in after else kept
+    )
+    fresh = Carver(VOLUME)
+    for view in before:
+        fresh.integrate(after.get(view.info.stamp_ns, view))
+    assert (part.stop > part.start) != np.array_equal(again._sums.total, changed._sums.total)
+    assert np.array_equal(again._sums.total, fresh._sums.total)
+    assert np.array_equal(again._sums.count, fresh._sums.count)
+    assert again.stamps == fresh.stamps
+
+
+@pytest.mark.parametrize("shift", [0, 3])
+def test_a_zone_of_echo_leaves_what_a_mask_without_it_leaves(shift):
+    rng = np.random.default_rng(4)
+    box = (slice(shift, 15), slice(shift, 30), slice(2, 30))
+    part = Volume(
+        tuple(VOLUME.origin_m[a] + box[2 - a].start * VOLUME.voxel_size_m for a in range(3)),
+        VOLUME.voxel_size_m,
+        tuple(s.stop - s.start for s in box),
+    )
+    whole, fresh = Carver(VOLUME), Carver(part)
+    views = [View(one.info, one.pixels.copy()) for one in patchy_masks(96)]
+    for view in views:
+        view.pixels[rng.random((96, 96)) < 0.3] = 64
+        whole.integrate(view)
+    sums = whole._sums.part(box, part)
+    for view in views:
+        zone = rng.random((96, 96)) < 0.5
+        sums.change_mask(view.pixels, view.pixels, view.info, zone)
+        alone = np.where((view.pixels == 64) & ~zone, np.uint8(0), view.pixels)
+        fresh.integrate(View(view.info, alone))
+    assert np.array_equal(sums.total, fresh._sums.total)
+    assert np.array_equal(sums.count, fresh._sums.count)
 
 
 def test_a_grid_is_a_picture_of_the_moment():

@@ -212,6 +212,21 @@ def _alike(
     return _LIT if inside == np.uint32(area) else _MIXED
 
 
+@kernel(inline="always")
+def _of_cell(cell: int, fu: float, fv: float) -> int:  # pragma: no cover
+    """Interpolate between the four pixels of a cell, which are known: a whole number of 1/4096."""
+    if cell == 15:
+        return _SCALE
+    if cell == 0:
+        return 0
+    right, low = np.float32(fu), np.float32(fv)
+    p00, p01 = np.float32(cell & 1), np.float32((cell >> 1) & 1)
+    p10, p11 = np.float32((cell >> 2) & 1), np.float32(cell >> 3)
+    upper = p00 + right * (p01 - p00)
+    value = upper + low * (p10 + right * (p11 - p10) - upper)
+    return int(value * np.float32(_SCALE) + np.float32(0.5))
+
+
 @kernel(fastmath={"contract", "arcp", "nsz"})
 def _carve_masks(  # noqa: C901, PLR0912  (a kernel)
     cells: NDArray[np.uint8],
@@ -279,15 +294,66 @@ def _carve_masks(  # noqa: C901, PLR0912  (a kernel)
                                 if cell >= 16:
                                     continue
                                 count[k, j, i] += np.uint16(1)
-                                if cell == 15:
-                                    total[k, j, i] += one
-                                elif cell:
-                                    fu, fv = np.float32(uu - iu), np.float32(vv - iv)
-                                    p00, p01 = np.float32(cell & 1), np.float32((cell >> 1) & 1)
-                                    p10, p11 = np.float32((cell >> 2) & 1), np.float32(cell >> 3)
-                                    upper = p00 + fu * (p01 - p00)
-                                    value = upper + fv * (p10 + fu * (p11 - p10) - upper)
-                                    total[k, j, i] += np.int32(value * np.float32(_SCALE) + np.float32(0.5))
+                                total[k, j, i] += np.int32(_of_cell(cell, uu - iu, vv - iv))
+
+
+@kernel(fastmath={"contract", "arcp", "nsz"})
+def _carve_changes(
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    at: tuple[int, int],
+    shape: tuple[int, int],
+    affines: NDArray[np.float64],
+    x0: float,
+    y0: float,
+    step: float,
+    first: int,
+    last: int,
+    total: NDArray[np.int32],
+    count: NDArray[np.uint16],
+) -> None:  # pragma: no cover
+    """Replace what a mask added to the slices [first, last) by what another adds.
+
+    `before` and `after` are the cells of the part of them in which they differ; it begins at `at` (row, col)
+    of an image of that shape.
+    """
+    rows, cols = before.shape
+    ny, nx = total.shape[1:]
+    low_u, high_u, low_v, high_v = at[1] - 1.0, at[1] + cols + 1.0, at[0] - 1.0, at[0] + rows + 1.0
+    for k in range(first, last):
+        a = affines[k]
+        du, dv = a[0, 0] * step, a[1, 0] * step
+        for j in range(ny):
+            y = y0 + j * step
+            u = a[0, 0] * x0 + a[0, 1] * y + a[0, 2]
+            v = a[1, 0] * x0 + a[1, 1] * y + a[1, 2]
+            # The voxels of the row whose shadows may fall on the part.
+            begin, end = 0, nx
+            for start, slope, low, high in ((u, du, low_u, high_u), (v, dv, low_v, high_v)):
+                if abs(slope) < 1e-12:
+                    if start < low or start > high:
+                        end = 0
+                    continue
+                one, two = (low - start) / slope, (high - start) / slope
+                begin = max(begin, math.floor(min(max(min(one, two), -1.0), nx + 1.0)))
+                end = min(end, math.ceil(min(max(max(one, two), -1.0), nx + 1.0)) + 1)
+            for i in range(begin, end):
+                uu, vv = u + i * du, v + i * dv
+                if uu < 0.0 or vv < 0.0 or uu > shape[1] - 1 or vv > shape[0] - 1:
+                    continue
+                iu, iv = min(int(uu), shape[1] - 2), min(int(vv), shape[0] - 2)
+                ju, jv = iu - at[1], iv - at[0]
+                if ju < 0 or jv < 0 or ju >= cols or jv >= rows:
+                    continue
+                old, new = np.int32(before[jv, ju]), np.int32(after[jv, ju])
+                if old == new:
+                    continue
+                if old < 16:
+                    count[k, j, i] -= np.uint16(1)
+                    total[k, j, i] -= np.int32(_of_cell(old, uu - iu, vv - iv))
+                if new < 16:
+                    count[k, j, i] += np.uint16(1)
+                    total[k, j, i] += np.int32(_of_cell(new, uu - iu, vv - iv))
 
 
 def _threads(pool: ThreadPoolExecutor | None, work: Any, slices: int) -> None:
@@ -365,6 +431,65 @@ class _Sums:
 
         _threads(self._pool, work, v.shape[0])
 
+    def part(self, box: tuple[slice, ...], volume: Volume) -> _Sums:
+        """Return the sums of a part of the volume, to be changed apart from these."""
+        part = _Sums(volume, self._pool)
+        part._total[:], part._count[:] = self.total[box], self.count[box]
+        return part
+
+    def change_mask(
+        self,
+        before: NDArray[np.uint8],
+        after: NDArray[np.uint8],
+        info: ViewInfo,
+        echo: NDArray[np.bool_] = _NOWHERE,
+    ) -> None:
+        """Replace a mask that was added, with covered pixels unknown, by another: `add_mask` of `after`.
+
+        Only voxels whose shadows fall where the two differ are looked up.
+        """
+        differ = before != after if echo.size == 0 else (before != after) | (after == MASK_COVERED) & ~echo
+        at = _box_of(differ)
+        if at is None:
+            return
+        v = self._volume
+        affines = _slice_affines(info, v)
+        first, shape = _part_of_image(affines, v, before.shape)
+        # The cells of which a pixel differs, as far as shadows of the volume fall.
+        begin = np.maximum(np.array(at[0]) - 1, first)
+        end = np.minimum(np.array(at[1]) + 1, np.array(first) + shape)
+        size = tuple(map(int, end - begin))
+        if min(shape) < 2 or min(size) < 2:
+            return
+        affines[:, :, 2] -= first[::-1]
+        corner = int(begin[0]), int(begin[1])
+        cells = []
+        for mask, zone in ((before, _NOWHERE), (after, echo)):
+            sums = np.zeros((size[0] + 1, size[1] + 1), np.uint32)
+            cells.append(np.empty(size, np.uint8))
+            _cells_of_mask(mask, zone, corner, cells[-1], sums)
+        # Of the last row and column the cells reach beyond the part.
+        old, new = (np.ascontiguousarray(each[:-1, :-1]) for each in cells)
+        offset = corner[0] - first[0], corner[1] - first[1]
+
+        def work(first: int, last: int) -> None:
+            _carve_changes(
+                old,
+                new,
+                offset,
+                shape,
+                affines,
+                v.origin_m[0],
+                v.origin_m[1],
+                v.voxel_size_m,
+                first,
+                last,
+                self._total,
+                self._count,
+            )
+
+        _threads(self._pool, work, v.shape[0])
+
     @property
     def total(self) -> NDArray[np.int32]:
         """Sum of all images, in 1/4096, shape (nz, ny, nx)."""
@@ -396,6 +521,14 @@ def _part_of_image(
     high = np.minimum(np.floor(pixels.max(axis=0)).astype(int) + 4, shape)
     size = np.maximum(high - low, 0)
     return (int(low[0]), int(low[1])), (int(size[0]), int(size[1]))
+
+
+def _box_of(where: NDArray[np.bool_]) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    """Return the first and last + 1 (row, col) of the pixels that are set; None where none is."""
+    rows, cols = np.flatnonzero(where.any(axis=1)), np.flatnonzero(where.any(axis=0))
+    if not len(rows):
+        return None
+    return (int(rows[0]), int(cols[0])), (int(rows[-1]) + 1, int(cols[-1]) + 1)
 
 
 class Carver:
@@ -550,14 +683,27 @@ class Carver:
 
     def _over(self, slope: SeabedSlope) -> Carver:
         """Carve the same masks again, over a seabed that slopes."""
-        return self._again(lambda kept: KeptMask(slope.applied(kept.info), kept.packed))
+        over = Carver(self.volume, self.parameters, pool=self._pool)
+        for stamp, kept in self._masks.items():
+            over._masks[stamp] = KeptMask(slope.applied(kept.info), kept.packed)
+            over._sums.add_mask(kept.view().pixels, over._masks[stamp].info)
+        over.stamps = set(self.stamps)
+        return over
 
     def _again(self, change: Callable[[KeptMask], KeptMask]) -> Carver:
-        """Carve the same masks again, each changed."""
+        """Carve the same views again, their masks changed: only what these changes change is looked up."""
         again = Carver(self.volume, self.parameters, pool=self._pool)
-        for (stamp, _), kept in in_order(lambda item: change(item[1]), self._masks.items(), _LOOKERS):
-            again._masks[stamp] = kept
-            again._sums.add_mask(kept.view().pixels, kept.info)
+        again._sums = self._sums.part((slice(None),) * 3, self.volume)
+
+        def changed(item: tuple[int, KeptMask]) -> tuple[KeptMask, NDArray[np.uint8], NDArray[np.uint8]]:
+            after = change(item[1])
+            before = item[1].view().pixels
+            return after, before, before if after is item[1] else after.view().pixels
+
+        for (stamp, kept), (after, old, new) in in_order(changed, self._masks.items(), _LOOKERS):
+            again._masks[stamp] = after
+            if after is not kept:
+                again._sums.change_mask(old, new, kept.info)
         again.stamps = set(self.stamps)
         return again
 
@@ -656,9 +802,12 @@ class Carver:
         return mean.unexplained, mean.lit
 
     def lost(self, body: VoxelGrid, instead: VoxelGrid, others: Sequence[VoxelGrid] = ()) -> bool:
-        """Say whether carving lost most of a body, and another grid of it explains its shadow better."""
+        """Say whether carving lost most of a body, and another grid of it explains its shadow better.
+
+        Where carving left nothing, the other grid is a body if it explains most of its shadow.
+        """
         if not body.occupied.any():
-            return True
+            return not self.misfit([instead, *others])[0] > _LOST
         unexplained, lit = self.misfit([body, *others])
         if not unexplained > _LOST:
             return False
@@ -737,7 +886,7 @@ class Carver:
         """Carve again what the first look left, with the pixels that its own echo cannot cover as seabed."""
         echoes = _Echoes(first.occupied, self.volume, _SECOND_LOOK_VOXELS)
         box, part = echoes.box, echoes.part
-        sums = _Sums(part, self._pool)
+        sums = self._sums.part(box, part)
 
         def look(kept: KeptMask) -> tuple[View, NDArray[np.bool_]]:
             view = kept.view()
@@ -746,7 +895,8 @@ class Carver:
             return view, echoes.zone(kept)
 
         for _, (view, zone) in in_order(look, self._masks.values(), _LOOKERS):
-            sums.add_mask(view.pixels, view.info, zone)
+            if zone.size:
+                sums.change_mask(view.pixels, view.pixels, view.info, zone)
         likelihood, views = first.likelihood.copy(), first.views.copy()
         likelihood[box] = _mean(sums.total, sums.count, self.parameters, len(self.stamps))
         views[box] = sums.count

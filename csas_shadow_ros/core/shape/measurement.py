@@ -33,6 +33,7 @@ from ..geometry import TWO_PI, View, ViewInfo, cross_range_axis, down_range_axis
 from ..imaging.likelihood import Levels
 from ..imaging.local_means import LocalMeans
 from ..imaging.mask_codes import MASK_SHADOW, MASK_UNKNOWN
+from ..methods import method_named
 from .contour import Contour, contour_height, contour_of
 from .echo_sides import echo_reach_px
 from .mesh import Dimensions, digits_of, measure
@@ -83,8 +84,11 @@ _OUTSIDE_CELLS = 0.15
 #: beside see it so much farther out still than their shadows end, in their median (cross-range cells).
 #: Without the former boxes, crates and poles with bright walls come out 1 to 2 cells too wide.
 _ECHO_SPREAD_CELLS, _ECHO_BEYOND_CELLS = 0.75, 0.75
-#: The carved voxels stand in for sides that no view shows; beside an edge that is seen they count so much.
-_VOXEL_WEIGHT = 0.1
+#: The carved voxels stand in for sides that no view shows: they count so much beside an edge that is seen,
+#: and so much where none is within half an aperture. Where two shadows touch, no view shows the side between.
+#: The demonstration's frame, 0.50 m wide, is measured as 0.73 m with 0.1 there, 0.59 m with 0.3, 0.57 m with 1
+#: (its carved voxels have 0.58 m).
+_VOXEL_WEIGHT, _VOXEL_ALONE = 0.1, 1.0
 #: A side that stands out of the carved voxels by more than this (cross-range cells) belongs to something else
 #: whose shadow touches the target's.
 _FOREIGN_CELLS = 3.0
@@ -112,6 +116,12 @@ _CAP_SLACK = (0.2, 0.3)
 _CAP_TIP, _CAP_TIP_SHARE = 2.0, 1.0 / 3.0
 #: How gradually it begins tells a dome: between these two, voxels under the cap's top.
 _DOME_SLACK = (0.5, 2.0)
+#: Carving keeps of a top what nearly all views keep, and views scatter. Half of them keep more, on the
+#: columns of the tip and so many voxels around: the height takes this share of the difference, and its
+#: interval all of it. Chosen on 19 bodies of the development half and 52 of ten tapering families whose height
+#: no shadow tells otherwise: 47 and 69 % of them within 5 % or a voxel without it, 58 and 77 % with it, 42 and
+#: 73 % at half, 42 and 83 % at double of the share.
+_TIP_VOXELS, _TIP_SHARE = 2, 0.3
 #: Walls are upright if more than this share of the silhouettes' sides are straight and of the views tell one
 #: height, to its error, which is within so many voxels of a flat top as the carved cap or the contours tell
 #: it.
@@ -441,7 +451,10 @@ class PlanFit:
         self._aperture = np.concatenate([seen[:, 2], np.zeros(_DIRECTIONS)])
         about = self.centre[0] * np.cos(self._phi) + self.centre[1] * np.sin(self._phi)
         self._values = np.concatenate([seen[:, 1], own]) - about
-        self._weights = np.concatenate([np.ones(self.count), np.full(_DIRECTIONS, _VOXEL_WEIGHT)])
+        away = np.abs(np.mod(coarse[:, None] - seen[None, :, 0] + math.pi, TWO_PI) - math.pi)
+        alone = ~(away <= seen[None, :, 2] / 2.0).any(axis=1)
+        weights = np.where(alone, _VOXEL_ALONE, _VOXEL_WEIGHT)
+        self._weights = np.concatenate([np.ones(self.count), weights])
         self._robust = np.ones_like(self._weights)
         #: How far sides scatter about the plan, 1σ, m.
         self.spread_m = 0.0
@@ -568,11 +581,14 @@ class Cap:
         Height (m) of the top, if it is round.
     top_m : float
         Height (m) of the cap's own top.
+    half_m : float
+        Height (m) that half of the views keep there: at least the cap's top.
     """
 
     begins_m: float
     dome_m: float
     top_m: float
+    half_m: float
 
 
 def cap_of(grid: VoxelGrid, grazing_rad: float) -> Cap:
@@ -615,7 +631,34 @@ def cap_of(grid: VoxelGrid, grazing_rad: float) -> Cap:
     z_near, z_far = (lowest(slack) for slack in _DOME_SLACK)
     root_t = max(0.0, (z_near - z_far - (far - near)) / (2.0 * (math.sqrt(far) - math.sqrt(near))))
     dome = z_near + (root_t + math.sqrt(near)) ** 2
-    return Cap(begins, float(np.clip(dome, begins, max(begins, faces[-1]))), float(faces[-1]))
+    return Cap(
+        begins,
+        float(np.clip(dome, begins, max(begins, faces[-1]))),
+        float(faces[-1]),
+        float(faces[-1]) + _kept_above(grid, int(layers[-1])),
+    )
+
+
+def _kept_above(grid: VoxelGrid, last: int) -> float:
+    """Return how much more (m) half of the views keep of an object's top, `last` its highest layer.
+
+    0 where the grid does not count views.
+    """
+    if not method_named(grid.method).takes_masks or not grid.threshold < 0.5:
+        return 0.0
+    tip = scipy.ndimage.binary_dilation(grid.occupied[last], iterations=_TIP_VOXELS)
+    above = grid.likelihood[last:, tip]
+    # Unknown voxels are not kept.
+    least = np.where(np.isnan(above), 1.0, above).min(axis=1)
+
+    def reaches(share: float) -> float:
+        where = int(np.argmax(least >= share)) if (least >= share).any() else len(least) - 1
+        if where == 0 or least[where] < share:
+            return float(where)
+        low, high = least[where - 1], least[where]
+        return where - 1 + float((share - low) / (high - low))
+
+    return (reaches(0.5) - reaches(grid.threshold)) * grid.volume.voxel_size_m
 
 
 def upright_height(
@@ -777,9 +820,10 @@ def measure_object(
     if height is None and told is not None:
         height, sigma = told.height_m, math.hypot(told.sigma_m, d / 2.0)
     elif height is None:
-        # Flat or round: half-way. The true top lies anywhere in the cap.
-        height = standing_height(sides, measured, grid, sigma) or 0.5 * (cap.begins_m + cap.dome_m)
-        sigma = math.hypot(sigma, max(cap.top_m - height, height - cap.begins_m, 0.0) / _SIGMAS_95)
+        # Flat or round: half-way. The true top lies anywhere in the cap, or where half of the views end.
+        middle = 0.5 * (cap.begins_m + cap.dome_m) + _TIP_SHARE * (cap.half_m - cap.top_m)
+        height = standing_height(sides, measured, grid, sigma) or middle
+        sigma = math.hypot(sigma, max(cap.half_m - height, height - cap.begins_m, 0.0) / _SIGMAS_95)
     intervals["height_m"] = (max(0.0, height - _SIGMAS_95 * sigma), height + _SIGMAS_95 * sigma)
     # A surface that lies wrong by one error everywhere.
     change = float(mesh.area) * math.hypot(edge / 2.0, d / 4.0)
