@@ -208,10 +208,10 @@ def test_sides_that_err_beside_a_gap_do_not_tell_what_lies_in_it(gap_deg):
     # As where a neighbour's shadow touches this one's, seen along both.
     exact = drawn_sides(box_support(0.6, 0.3), keep=lambda degrees: 0.5 * gap_deg < degrees % 180.0)
     exact = [one for one in exact if math.degrees(one.info.aspect_rad) % 180.0 < 180.0 - 0.5 * gap_deg]
-    out = [
-        replace(one, support_m=tuple(s + 0.02 * abs(math.sin(p)) for s, p in zip(one.support_m, one.direction_rad)))
-        for one in exact
-    ]
+    out = []
+    for one in exact:
+        off = 0.02 * np.abs(np.sin(one.direction_rad))
+        out.append(replace(one, support_m=tuple(np.asarray(one.support_m) + off)))
     z, y, x = np.meshgrid(VOLUME.z_m, VOLUME.y_m, VOLUME.x_m, indexing="ij")
     occupied = (np.abs(x) < 0.3) & (np.abs(y) < 0.15) & (z < 0.2)
     assert widths(PlanFit(out, grid_of(occupied)))[1] == pytest.approx(0.3, abs=0.03)

@@ -86,8 +86,8 @@ _OUTSIDE_CELLS = 0.15
 _ECHO_SPREAD_CELLS, _ECHO_BEYOND_CELLS = 0.75, 0.75
 #: The carved voxels stand in for sides that no view shows: they count so much beside an edge that is seen,
 #: and so much where none is within half an aperture. Where two shadows touch, no view shows the side between.
-#: The demonstration's frame, 0.50 m wide, is measured as 0.73 m with 0.1 there, 0.59 m with 0.3, 0.57 m with 1
-#: (its carved voxels have 0.58 m).
+#: The demonstration's frame, 0.50 m wide, is measured as 0.73 m with 0.1 there, 0.59 m with 0.3, 0.57 m with
+#: 1 (its carved voxels have 0.58 m).
 _VOXEL_WEIGHT, _VOXEL_ALONE = 0.1, 1.0
 #: A side that stands out of the carved voxels by more than this (cross-range cells) belongs to something else
 #: whose shadow touches the target's.
@@ -118,9 +118,9 @@ _CAP_TIP, _CAP_TIP_SHARE = 2.0, 1.0 / 3.0
 _DOME_SLACK = (0.5, 2.0)
 #: Carving keeps of a top what nearly all views keep, and views scatter. Half of them keep more, on the
 #: columns of the tip and so many voxels around: the height takes this share of the difference, and its
-#: interval all of it. Chosen on 19 bodies of the development half and 52 of ten tapering families whose height
-#: no shadow tells otherwise: 47 and 69 % of them within 5 % or a voxel without it, 58 and 77 % with it, 42 and
-#: 73 % at half, 42 and 83 % at double of the share.
+#: interval all of it. Chosen on 19 bodies of the development half and 52 of ten tapering families whose
+#: height no shadow tells otherwise: 47 and 69 % of them within 5 % or a voxel without it, 58 and 77 % with
+#: it, 42 and 73 % at half, 42 and 83 % at double of the share.
 _TIP_VOXELS, _TIP_SHARE = 2, 0.3
 #: Walls are upright if more than this share of the silhouettes' sides are straight and of the views tell one
 #: height, to its error, which is within so many voxels of a flat top as the carved cap or the contours tell
