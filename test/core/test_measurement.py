@@ -38,6 +38,7 @@ from csas_shadow_ros.core.shape.measurement import (
     levels_of_mask,
     measure_object,
     shadow_height,
+    sides_apart,
     silhouette_sides,
     upright_height,
 )
@@ -215,6 +216,44 @@ def test_sides_that_err_beside_a_gap_do_not_tell_what_lies_in_it(gap_deg):
     z, y, x = np.meshgrid(VOLUME.z_m, VOLUME.y_m, VOLUME.x_m, indexing="ij")
     occupied = (np.abs(x) < 0.3) & (np.abs(y) < 0.15) & (z < 0.2)
     assert widths(PlanFit(out, grid_of(occupied)))[1] == pytest.approx(0.3, abs=0.03)
+
+
+def touched(sides, arc_deg, by_m=0.15):
+    """Another shadow touches sides that face along +x, as seen from one aspect only."""
+    out = []
+    for one in sides:
+        support = []
+        for phi, s in zip(one.direction_rad, one.support_m, strict=True):
+            along_x = math.cos(phi) > math.cos(math.radians(arc_deg / 2))
+            support.append(s + by_m * (along_x and math.sin(phi - one.info.aspect_rad) > 0))
+        out.append(replace(one, support_m=tuple(support)))
+    return out
+
+
+@pytest.mark.parametrize(("arc_deg", "share"), [(0.0, 0.0), (30.0, 30 / 360), (90.0, 90 / 360)])
+def test_sides_that_opposite_views_see_at_different_places_are_counted(arc_deg, share):
+    sides = touched(drawn_sides(box_support(0.6, 0.4)), arc_deg)
+    assert sides_apart(sides) == pytest.approx(share, abs=0.02)
+    # Of half a circle no side is seen twice.
+    half = [one for one in sides if one.info.aspect_rad < math.pi - 0.3]
+    assert sides_apart(half) == 0.0
+    assert sides_apart([]) == 0.0
+
+
+def test_an_extent_whose_sides_lie_apart_is_told_with_less_certainty():
+    exact = drawn_sides(box_support(0.6, 0.4))
+    z, y, x = np.meshgrid(VOLUME.z_m, VOLUME.y_m, VOLUME.x_m, indexing="ij")
+    grid = grid_of((np.abs(x) < 0.3) & (np.abs(y) < 0.2) & (z < 0.2))
+    mesh = mesh_from_grid(grid)
+    halves = {}
+    for name, sides in (("sure", exact), ("touched", touched(exact, 40.0, 0.3))):
+        low, high = measure_object(grid, mesh, sides).intervals["length_m"]
+        across = measure_object(grid, mesh, sides).intervals["width_m"]
+        halves[name] = (high - low) / 2, (across[1] - across[0]) / 2
+    cell_m = float(INFOS[0].resolution_m[1])
+    assert halves["touched"][0] > 0.3 - 1.5 * cell_m > halves["sure"][0]
+    # Nothing is wrong with the other pair of sides.
+    assert halves["touched"][1] < 1.5 * halves["sure"][1]
 
 
 def test_sides_of_something_else_do_not_count():

@@ -294,7 +294,7 @@ def _carve_masks(  # noqa: C901, PLR0912  (a kernel)
                                 if cell >= 16:
                                     continue
                                 count[k, j, i] += np.uint16(1)
-                                total[k, j, i] += np.int32(_of_cell(cell, uu - iu, vv - iv))
+                                total[k, j, i] += np.int32(_of_cell(int(cell), uu - iu, vv - iv))
 
 
 @kernel(fastmath={"contract", "arcp", "nsz"})
@@ -345,7 +345,7 @@ def _carve_changes(
                 ju, jv = iu - at[1], iv - at[0]
                 if ju < 0 or jv < 0 or ju >= cols or jv >= rows:
                     continue
-                old, new = np.int32(before[jv, ju]), np.int32(after[jv, ju])
+                old, new = int(before[jv, ju]), int(after[jv, ju])
                 if old == new:
                     continue
                 if old < 16:

@@ -37,6 +37,7 @@ from ..methods import method_named
 from .contour import Contour, contour_height, contour_of
 from .echo_sides import echo_reach_px
 from .mesh import Dimensions, digits_of, measure
+from .opposed import doubt_cells, opposed_share, opposed_sides
 from .seabed import largest_piece, leaves_image
 from .volume import VoxelGrid
 
@@ -802,7 +803,12 @@ def measure_object(
         # views do not move, are what all agree on.
         solid = _without_thin_parts(grid, _THIN_CELLS * across)
         plan = _rectangle(_voxel_support(solid, fit.directions), np.zeros(2))
-    intervals = _plan_intervals(plan, resampled, edge)
+    aperture = float(np.median([side.info.aperture_rad for side in sides]))
+    apart = opposed_sides(sides, by_shadows)
+    doubts = [
+        across * doubt_cells(*apart, plan.heading_rad + turn, aperture) for turn in (0.0, math.pi / 2.0)
+    ]
+    intervals = _plan_intervals(plan, resampled, edge, (doubts[0], doubts[1]))
     cap = cap_of(grid, grazing)
     sigma = math.hypot(d / 2.0, down * math.tan(grazing))
     measured = replace(
@@ -831,15 +837,21 @@ def measure_object(
     return replace(measured, height_m=height, intervals=intervals, scatter_cells=spread_m / across)
 
 
+def sides_apart(sides: Sequence[SilhouetteSides]) -> float:
+    """Return the share of a body's sides that opposite views see at different places (`opposed_sides`)."""
+    return opposed_share(opposed_sides(sides, _agreed_support(sides))[1])
+
+
 def _plan_intervals(
-    plan: _Rectangle, resampled: Sequence[_Rectangle], edge_m: float
+    plan: _Rectangle, resampled: Sequence[_Rectangle], edge_m: float, doubt_m: tuple[float, float]
 ) -> dict[str, tuple[float, float]]:
-    """Return the 95 % intervals of a plan by its resamplings, and the error of an edge."""
+    """Return the 95 % intervals of a plan by its resamplings, an edge's error, and what views see apart."""
     intervals = {}
-    for name in ("length_m", "width_m"):
+    for name, doubt in zip(("length_m", "width_m"), doubt_m, strict=True):
         value = getattr(plan, name)
         sigma = math.hypot(float(np.std([getattr(r, name) for r in resampled])), edge_m)
-        intervals[name] = (max(0.0, value - _SIGMAS_95 * sigma), value + _SIGMAS_95 * sigma)
+        half = math.hypot(_SIGMAS_95 * sigma, doubt)
+        intervals[name] = (max(0.0, value - half), value + half)
     for axis, name in enumerate(("position_x_m", "position_y_m")):
         sigma = math.hypot(float(np.std([r.position_m[axis] for r in resampled])), edge_m / 2.0)
         value = plan.position_m[axis]
@@ -906,6 +918,7 @@ __all__ = [
     "levels_of_mask",
     "measure_object",
     "shadow_height",
+    "sides_apart",
     "silhouette_sides",
     "upright_height",
 ]

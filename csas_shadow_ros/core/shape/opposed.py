@@ -1,0 +1,88 @@
+"""Do views from opposite sides bound a plan at the same place?
+
+A direction's side is seen from two aspects, half a circle apart. A body's own side lies at one place. Where
+the two disagree, another shadow touches the body's in one of them, or a part of it casts none there. Nothing
+tells which.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry import TWO_PI
+
+if TYPE_CHECKING:
+    from .measurement import SilhouetteSides
+
+FloatArray = NDArray[np.float64]
+
+#: Sides within so much of an aperture look at the same side of the body.
+_WITHIN = 0.75
+#: So many of them at least, seen from either aspect: one may be a bad silhouette.
+_LEAST = 2
+_DIRECTIONS = 120
+#: Sides lie apart if it is by more than this (cross-range cells): an edge is found to 0.8.
+APART_CELLS = 2.0
+#: What is found of an edge anyhow (cross-range cells): an interval has it already.
+_EDGE_CELLS = 1.0
+
+
+def opposed_sides(sides: Sequence[SilhouetteSides], support_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far the sides lie apart that opposite views see.
+
+    Parameters
+    ----------
+    sides : sequence of SilhouetteSides
+        Of all views.
+    support_m : ndarray of float
+        The support of each of their sides, m.
+
+    Returns
+    -------
+    direction_rad : ndarray of float, shape (120,)
+        Directions of sides.
+    apart_cells : ndarray of float, shape (120,)
+        Difference of the medians from either aspect, cross-range cells; NaN where one of them sees nothing.
+    """
+    directions: FloatArray = np.arange(_DIRECTIONS, dtype=np.float64) * (TWO_PI / _DIRECTIONS)
+    apart: FloatArray = np.full(_DIRECTIONS, math.nan)
+    if not sides:
+        return directions, apart
+    phi = np.array([angle for side in sides for angle in side.direction_rad])
+    right = np.array([math.sin(a - side.info.aspect_rad) > 0 for side in sides for a in side.direction_rad])
+    within = _WITHIN * np.array([side.info.aperture_rad for side in sides for _ in side.direction_rad])
+    cell_m = float(np.median([side.info.resolution_m[1] for side in sides]))
+    for n, direction in enumerate(directions):
+        near = np.abs(np.mod(phi - direction + math.pi, TWO_PI) - math.pi) <= within + 1e-9
+        seen = [support_m[near & (right == from_right)] for from_right in (True, False)]
+        if min(map(len, seen)) >= _LEAST:
+            apart[n] = abs(float(np.median(seen[0]) - np.median(seen[1]))) / cell_m
+    return directions, apart
+
+
+def doubt_cells(directions: FloatArray, apart: FloatArray, face_rad: float, aperture_rad: float) -> float:
+    """Return how far an extent may be off as its two sides lie apart, cross-range cells.
+
+    Parameters
+    ----------
+    directions, apart : ndarray of float
+        As `opposed_sides` returns them.
+    face_rad : float
+        Direction that one of the sides faces; the other faces away from it.
+    aperture_rad : float
+        What lies apart within it counts.
+    """
+    away = np.abs(np.mod(directions - face_rad + math.pi / 2.0, math.pi) - math.pi / 2.0)
+    near = apart[(away <= aperture_rad + 1e-9) & np.isfinite(apart)]
+    return max(0.0, float(near.max()) - _EDGE_CELLS) if len(near) else 0.0
+
+
+def opposed_share(apart: FloatArray) -> float:
+    """Return the share of the sides that opposite views see at different places; 0 where none is seen."""
+    known = apart[np.isfinite(apart)]
+    return float((known > APART_CELLS).mean()) if len(known) else 0.0
