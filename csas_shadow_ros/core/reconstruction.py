@@ -28,7 +28,7 @@ from .imaging.masks import KeptMask
 from .imaging.segmentation import require_silhouette
 from .parameters import PipelineParameters
 from .search.decision import Decision
-from .search.pieces import APART_CELLS, nothing_left, objects_of, reaches_through, without_neighbours
+from .search.pieces import APART_CELLS, nothing_left, objects_of, without_neighbours
 from .shape.carving import Carver, compared_shadows
 from .shape.explained import ShadowFit, mean_fit
 from .shape.hollows import EchoLook, matter_mesh, matter_of
@@ -472,7 +472,6 @@ class Reconstruction:
             body = self.bodies[0]
             if final:
                 (result.grid, result.other_grid), rest = self._without_neighbours(shapes[0])
-                self._require_inside(result)
             else:
                 result.grid = body.carver.first_look()
             result.timings_s["carve"] = time.perf_counter() - began
@@ -498,17 +497,6 @@ class Reconstruction:
             result.timings_s["compare"] = time.perf_counter() - since
         judge(result)
         return result
-
-    @staticmethod
-    def _require_inside(result: Result) -> None:
-        """Take what reaches through opposite sides of the volume that the search chose for no object."""
-        grid, target = result.grid, result.target
-        if grid is None or target is None or math.isnan(target.evidence):
-            return
-        if reason := reaches_through(grid):
-            result.left_out.append(LeftOut(target.position_m, reason, strong=True))
-            nothing = np.zeros_like(grid.occupied)
-            result.grid = replace(grid, occupied=nothing, threshold=math.nan)
 
     @staticmethod
     def _measure(result: Result, body: Body) -> None:

@@ -105,7 +105,7 @@ def warm_carving(parameters: CarvingParameters | None = None) -> None:
     shadow = _shadow_view()
     if p.takes_masks:
         pixels = np.where(shadow.pixels < 0.5, np.uint8(255), np.uint8(0))
-        pixels[:10] = 64  # covered pixels: the second look is taken
+        pixels[:, : _SIDE // 2] = 64  # covered pixels: carving looks twice
     else:
         pixels = np.clip(shadow.pixels, 0.0, 1.0)
     view = replace(shadow, pixels=pixels)
@@ -121,6 +121,7 @@ def warm_carving(parameters: CarvingParameters | None = None) -> None:
     measure(mesh_from_grid(grid))
     if method_named(p.method).looks_twice:
         carver.shadow_fits([grid])
+        carver.leaner()
         voxels = np.ascontiguousarray(np.argwhere(occupied), np.int32)
         count_shadow_pixels(view, grid.volume, voxels, pixels > 0, np.zeros(len(voxels), np.int32))
     for one in _both(shadow):

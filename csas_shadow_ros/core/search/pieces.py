@@ -99,21 +99,6 @@ def without_neighbours(
     return replace(grid, occupied=own), replace(grid, occupied=grid.occupied & ~own)
 
 
-def reaches_through(grid: VoxelGrid) -> str:
-    """Say through which opposite sides of its volume an object reaches; empty if through none.
-
-    The search takes a volume with a margin round what stands out. What fills it from side to side is no body
-    that stands on a seabed round about, or is larger than its search saw.
-    """
-    plan = np.asarray(grid.occupied.any(axis=0))
-    ends = {"west and east": (plan[:, 0], plan[:, -1]), "south and north": (plan[0], plan[-1])}
-    through = [name for name, pair in ends.items() if all(end.any() for end in pair)]
-    if not through:
-        return ""
-    sides = " and the ".join(through)
-    return f"it reaches through the {sides} sides of its volume: sediment, or a larger body"
-
-
 def overlap_share(a: VoxelGrid, b: VoxelGrid) -> float:
     """Return the overlap of two grids' objects, as a fraction of the smaller one (by volume).
 

@@ -175,6 +175,27 @@ def _cells_of_mask(
 
 
 @kernel(inline="always")
+def _pixels_of(
+    a: NDArray[np.float64], x0: float, y0: float, step: float, i0: int, i1: int, j0: int, j1: int
+) -> tuple[int, int, int, int]:  # pragma: no cover
+    """Return what pixels voxels [j0, j1) × [i0, i1) of a slice fall on: [left, right), [top, bottom).
+
+    And one more all round: rounding, and neighbours in interpolation.
+    """
+    y = y0 + j0 * step
+    du, dv = a[0, 0] * step, a[1, 0] * step
+    u = a[0, 0] * x0 + a[0, 1] * y + a[0, 2] + i0 * du
+    v = a[1, 0] * x0 + a[1, 1] * y + a[1, 2] + i0 * dv
+    ru, rv = (i1 - 1 - i0) * du, (i1 - 1 - i0) * dv
+    su, sv = (j1 - 1 - j0) * a[0, 1] * step, (j1 - 1 - j0) * a[1, 1] * step
+    left = math.floor(u + min(ru, 0.0) + min(su, 0.0)) - 1
+    right = math.floor(u + max(ru, 0.0) + max(su, 0.0)) + 3
+    top = math.floor(v + min(rv, 0.0) + min(sv, 0.0)) - 1
+    bottom = math.floor(v + max(rv, 0.0) + max(sv, 0.0)) + 3
+    return left, right, top, bottom
+
+
+@kernel(inline="always")
 def _alike(
     sums: NDArray[np.uint32],
     a: NDArray[np.float64],
@@ -188,17 +209,7 @@ def _alike(
 ) -> int:  # pragma: no cover
     """Say what voxels [j0, j1) × [i0, i1) of a slice see: all the same, one of these, or `_MIXED`."""
     rows, cols = sums.shape[0] - 1, sums.shape[1] - 1
-    # Their pixels, and one more all round: rounding, and neighbours in interpolation.
-    y = y0 + j0 * step
-    du, dv = a[0, 0] * step, a[1, 0] * step
-    u = a[0, 0] * x0 + a[0, 1] * y + a[0, 2] + i0 * du
-    v = a[1, 0] * x0 + a[1, 1] * y + a[1, 2] + i0 * dv
-    ru, rv = (i1 - 1 - i0) * du, (i1 - 1 - i0) * dv
-    su, sv = (j1 - 1 - j0) * a[0, 1] * step, (j1 - 1 - j0) * a[1, 1] * step
-    left = math.floor(u + min(ru, 0.0) + min(su, 0.0)) - 1
-    right = math.floor(u + max(ru, 0.0) + max(su, 0.0)) + 3
-    top = math.floor(v + min(rv, 0.0) + min(sv, 0.0)) - 1
-    bottom = math.floor(v + max(rv, 0.0) + max(sv, 0.0)) + 3
+    left, right, top, bottom = _pixels_of(a, x0, y0, step, i0, i1, j0, j1)
     if right <= 0 or bottom <= 0 or left >= cols or top >= rows:
         return _NOTHING
     area = (right - left) * (bottom - top)
@@ -298,9 +309,10 @@ def _carve_masks(  # noqa: C901, PLR0912  (a kernel)
 
 
 @kernel(fastmath={"contract", "arcp", "nsz"})
-def _carve_changes(
+def _carve_changes(  # noqa: C901  (a kernel)
     before: NDArray[np.uint8],
     after: NDArray[np.uint8],
+    differ: NDArray[np.int32],
     at: tuple[int, int],
     shape: tuple[int, int],
     affines: NDArray[np.float64],
@@ -315,45 +327,46 @@ def _carve_changes(
     """Replace what a mask added to the slices [first, last) by what another adds.
 
     `before` and `after` are the cells of the part of them in which they differ; it begins at `at` (row, col)
-    of an image of that shape.
+    of an image of that shape. `differ[v, u]` counts the cells that differ above v and left of u of it.
     """
     rows, cols = before.shape
     ny, nx = total.shape[1:]
-    low_u, high_u, low_v, high_v = at[1] - 1.0, at[1] + cols + 1.0, at[0] - 1.0, at[0] + rows + 1.0
     for k in range(first, last):
         a = affines[k]
         du, dv = a[0, 0] * step, a[1, 0] * step
-        for j in range(ny):
-            y = y0 + j * step
-            u = a[0, 0] * x0 + a[0, 1] * y + a[0, 2]
-            v = a[1, 0] * x0 + a[1, 1] * y + a[1, 2]
-            # The voxels of the row whose shadows may fall on the part.
-            begin, end = 0, nx
-            for start, slope, low, high in ((u, du, low_u, high_u), (v, dv, low_v, high_v)):
-                if abs(slope) < 1e-12:
-                    if start < low or start > high:
-                        end = 0
+        for j0 in range(0, ny, _BLOCK):
+            j1 = min(j0 + _BLOCK, ny)
+            for i0 in range(0, nx, _BLOCK):
+                i1 = min(i0 + _BLOCK, nx)
+                left, right, top, bottom = _pixels_of(a, x0, y0, step, i0, i1, j0, j1)
+                left, right = max(left - at[1], 0), min(right - at[1], cols)
+                top, bottom = max(top - at[0], 0), min(bottom - at[0], rows)
+                if left >= right or top >= bottom:
                     continue
-                one, two = (low - start) / slope, (high - start) / slope
-                begin = max(begin, math.floor(min(max(min(one, two), -1.0), nx + 1.0)))
-                end = min(end, math.ceil(min(max(max(one, two), -1.0), nx + 1.0)) + 1)
-            for i in range(begin, end):
-                uu, vv = u + i * du, v + i * dv
-                if uu < 0.0 or vv < 0.0 or uu > shape[1] - 1 or vv > shape[0] - 1:
+                inside = differ[bottom, right] - differ[top, right] - differ[bottom, left] + differ[top, left]
+                if inside == 0:
                     continue
-                iu, iv = min(int(uu), shape[1] - 2), min(int(vv), shape[0] - 2)
-                ju, jv = iu - at[1], iv - at[0]
-                if ju < 0 or jv < 0 or ju >= cols or jv >= rows:
-                    continue
-                old, new = int(before[jv, ju]), int(after[jv, ju])
-                if old == new:
-                    continue
-                if old < 16:
-                    count[k, j, i] -= np.uint16(1)
-                    total[k, j, i] -= np.int32(_of_cell(old, uu - iu, vv - iv))
-                if new < 16:
-                    count[k, j, i] += np.uint16(1)
-                    total[k, j, i] += np.int32(_of_cell(new, uu - iu, vv - iv))
+                for j in range(j0, j1):
+                    y = y0 + j * step
+                    u = a[0, 0] * x0 + a[0, 1] * y + a[0, 2]
+                    v = a[1, 0] * x0 + a[1, 1] * y + a[1, 2]
+                    for i in range(i0, i1):
+                        uu, vv = u + i * du, v + i * dv
+                        if uu < 0.0 or vv < 0.0 or uu > shape[1] - 1 or vv > shape[0] - 1:
+                            continue
+                        iu, iv = min(int(uu), shape[1] - 2), min(int(vv), shape[0] - 2)
+                        ju, jv = iu - at[1], iv - at[0]
+                        if ju < 0 or jv < 0 or ju >= cols or jv >= rows:
+                            continue
+                        old, new = int(before[jv, ju]), int(after[jv, ju])
+                        if old == new:
+                            continue
+                        if old < 16:
+                            count[k, j, i] -= np.uint16(1)
+                            total[k, j, i] -= np.int32(_of_cell(old, uu - iu, vv - iv))
+                        if new < 16:
+                            count[k, j, i] += np.uint16(1)
+                            total[k, j, i] += np.int32(_of_cell(new, uu - iu, vv - iv))
 
 
 def _threads(pool: ThreadPoolExecutor | None, work: Any, slices: int) -> None:
@@ -448,8 +461,10 @@ class _Sums:
 
         Only voxels whose shadows fall where the two differ are looked up.
         """
-        differ = before != after if echo.size == 0 else (before != after) | (after == MASK_COVERED) & ~echo
-        at = _box_of(differ)
+        changed = before != after
+        if echo.size:
+            changed |= (after == MASK_COVERED) & ~echo
+        at = _box_of(changed)
         if at is None:
             return
         v = self._volume
@@ -470,12 +485,15 @@ class _Sums:
             _cells_of_mask(mask, zone, corner, cells[-1], sums)
         # Of the last row and column the cells reach beyond the part.
         old, new = (np.ascontiguousarray(each[:-1, :-1]) for each in cells)
+        differ = np.zeros(size, np.int32)
+        np.cumsum(np.cumsum(old != new, axis=0, dtype=np.int32), axis=1, out=differ[1:, 1:])
         offset = corner[0] - first[0], corner[1] - first[1]
 
         def work(first: int, last: int) -> None:
             _carve_changes(
                 old,
                 new,
+                differ,
                 offset,
                 shape,
                 affines,
@@ -715,11 +733,15 @@ class Carver:
         fuller one darkens pixels of the silhouettes that the leaner one leaves lit.
         """
         fuller = self._second_look(first)
-        lean = self._again(KeptMask.near)
+        lean = self.leaner()
         leaner = lean.first_look()
         if leaner.occupied.any():
             leaner = lean._second_look(leaner)
         return self._asked_for(leaner, fuller)
+
+    def leaner(self) -> Carver:
+        """Carve the same views again, covered pixels far before a shadow taken for lit seabed."""
+        return self._again(KeptMask.near)
 
     def _asked_for(self, leaner: VoxelGrid, fuller: VoxelGrid, others: Sequence[VoxelGrid] = ()) -> VoxelGrid:
         """Add to the leaner of two bodies what of the fuller one explains shadow that nothing else does."""

@@ -423,6 +423,8 @@ class PlanFit:
         Ground point (m) that supports are taken about.
     directions : ndarray, shape (720,)
         Directions (rad) that `solve` answers for.
+    kept : ndarray of bool
+        Which sides take part: not those that stand out of the voxels.
     """
 
     def __init__(
@@ -441,11 +443,13 @@ class PlanFit:
         self.directions: FloatArray = _round_circle(_FINE_DIRECTIONS)
         coarse = _round_circle(_DIRECTIONS)
         own = _voxel_support(grid, coarse)
+        self.kept = np.ones(len(seen), np.bool_)
         if len(seen):
             cell = float(np.median([side.info.resolution_m[1] for side in sides]))
             margin = _FOREIGN_CELLS * cell + grid.volume.voxel_size_m
             expected = np.interp(seen[:, 0] % TWO_PI, coarse, own, period=TWO_PI)
-            seen = seen[np.abs(seen[:, 1] - expected) <= margin]
+            self.kept = np.abs(seen[:, 1] - expected) <= margin
+            seen = seen[self.kept]
         self.count = len(seen)
         self.centre = 2.0 * np.array([np.mean(own * np.cos(coarse)), np.mean(own * np.sin(coarse))])
         self._phi = np.concatenate([seen[:, 0], coarse])
@@ -788,6 +792,7 @@ def measure_object(
     support = fit.solve()
     # Shadows alone tell whether there is one plan: echoes would hide that they do not agree.
     spread_m = fit.spread_m
+    apart = opposed_sides(sides, np.where(fit.kept, by_shadows, np.nan))
     by_echoes = _with_echoes(by_shadows, sides)
     if (by_echoes != by_shadows).any():
         fit = PlanFit(sides, grid, by_echoes)
@@ -804,7 +809,6 @@ def measure_object(
         solid = _without_thin_parts(grid, _THIN_CELLS * across)
         plan = _rectangle(_voxel_support(solid, fit.directions), np.zeros(2))
     aperture = float(np.median([side.info.aperture_rad for side in sides]))
-    apart = opposed_sides(sides, by_shadows)
     doubts = [
         across * doubt_cells(*apart, plan.heading_rad + turn, aperture) for turn in (0.0, math.pi / 2.0)
     ]

@@ -40,7 +40,7 @@ def opposed_sides(sides: Sequence[SilhouetteSides], support_m: FloatArray) -> tu
     sides : sequence of SilhouetteSides
         Of all views.
     support_m : ndarray of float
-        The support of each of their sides, m.
+        The support of each of their sides, m; NaN for one that does not count.
 
     Returns
     -------
@@ -59,6 +59,7 @@ def opposed_sides(sides: Sequence[SilhouetteSides], support_m: FloatArray) -> tu
     cell_m = float(np.median([side.info.resolution_m[1] for side in sides]))
     for n, direction in enumerate(directions):
         near = np.abs(np.mod(phi - direction + math.pi, TWO_PI) - math.pi) <= within + 1e-9
+        near &= np.isfinite(support_m)
         seen = [support_m[near & (right == from_right)] for from_right in (True, False)]
         if min(map(len, seen)) >= _LEAST:
             apart[n] = abs(float(np.median(seen[0]) - np.median(seen[1]))) / cell_m

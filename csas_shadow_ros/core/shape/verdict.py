@@ -199,9 +199,7 @@ def _candidates(result: Result) -> list[str]:
     ]
     target = result.target
     # A volume that was given tells nothing of a shadow in it; one that the search found does.
-    searched = target is not None and not math.isnan(target.evidence)
-    told = target is not None and any(left.position_m == target.position_m for left in result.left_out)
-    if not result.objects and target is not None and result.final and searched and not told:
+    if not result.objects and target is not None and result.final and not math.isnan(target.evidence):
         found.insert(
             0,
             f"a candidate at {place_text(target.position_m)}: its shadow is too thin or too faint to carve"
