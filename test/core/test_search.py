@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from csas_shadow_ros.bags.check import WARNING, check_spectrum_sign
-from csas_shadow_ros.core.errors import SpectrumSignError
+from csas_shadow_ros.core.errors import NoTargetError, SpectrumSignError
 from csas_shadow_ros.core.imaging.subaperture import Spectrum
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.pipeline import run
@@ -256,3 +256,21 @@ def test_a_faint_body_under_a_wrong_sign_is_no_empty_seabed(contrast_db):
     assert (result.verdict, result.quality.verdict) == ("no object", "limited")
     (reason,) = result.quality.reasons
     assert reason.startswith("nothing tells the spectrum_sign: under the other")
+
+
+@pytest.mark.parametrize("kind", ["empty", "box"])
+def test_of_less_than_half_a_circle_nothing_tells_the_sign_and_the_rest_is_told(kind):
+    # From aspect 0 on; the views from the other side are missing.
+    made = simulate("tiny", kind, seed=2, faults=Faults(missing_arcs_deg=((150.0, 360.0),)))
+    result = run(made.image, made.track, COARSE)
+    assert result.sign.verdict == "unknown"
+    assert result.verdict == ("no object" if kind == "empty" else "object")
+    if kind == "box":
+        assert any("of the circle" in reason for reason in result.quality.reasons)
+
+
+def test_views_that_cannot_be_searched_are_an_error_that_names_why():
+    made = simulate("tiny", "empty", seed=2)
+    dark = replace(made.image, pixels=np.zeros_like(made.image.pixels))
+    with pytest.raises(NoTargetError, match=r"none of \d+ views can be searched: the seabed level"):
+        search_image(dark, made.track, Spectrum.of_image(dark))

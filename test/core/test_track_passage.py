@@ -98,6 +98,31 @@ def test_a_circle_of_any_size_place_and_arc_loses_no_pose(radius, high, off, sta
     assert passage(whole).track is whole
 
 
+@settings(max_examples=150, deadline=None)
+@given(
+    st.floats(1.0, 1.28),
+    st.floats(0.0, 180.0),
+    st.floats(0.0, 360.0),
+    st.floats(20.0, 130.0),
+    st.sampled_from([1, -1]),
+)
+def test_an_ellipse_goes_on_after_a_pause_of_the_record(axes, turned, start, pause, sense):
+    poses = circle(360, start=start, sense=sense) * (math.sqrt(axes), 1.0 / math.sqrt(axes), 1.0)
+    c, s = math.cos(math.radians(turned)), math.sin(math.radians(turned))
+    poses = poses @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    first = 170
+    whole = track(np.delete(poses, np.s_[first : first + int(pause)], axis=0))
+    assert passage(whole, image_ns=int(whole.stamps_ns[-1])).track is whole
+
+
+@pytest.mark.parametrize("scale", [0.6, 1.7])
+def test_another_circle_after_a_pause_of_the_record_is_left_out(scale):
+    whole = track(circle(440, arc=220.0), circle(200, arc=100.0, start=240.0, radius=30.0 * scale))
+    found = passage(whole, image_ns=int(whole.stamps_ns[439]))
+    assert kept(whole, found) == [(0, 439)]
+    assert "200 of 640 track poses are not on the circle" in found.notes[0]
+
+
 OUTSIDE = {
     "approach": (way(180, np.add(FIRST, (270, -40, 3)), FIRST), None),
     "approach from far away": (way(2000, np.add(FIRST, (1500, -200, 8)), FIRST), None),

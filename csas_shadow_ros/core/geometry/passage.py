@@ -50,6 +50,11 @@ _LEAST_ARC_RAD = math.radians(20.0)
 #: off at its ends. Within 5 % a vehicle settles on its circle; a tangent leaves that band after 18° of arc.
 #: At half of it, 12°, but a circle that closes 1 m beside its start loses its end; at double, 25°.
 _SPREADS, _TIGHT_SHARE, _BAND_SHARE = 6.0, 0.01, 0.05
+#: What comes after a pause of the record goes on with the circle if one circle passes both within this share
+#: of its radius. An ellipse whose axes differ by 16 % lies within 8 % of its circle, but the circle of one
+#: half of it is 40 % off the other's end. At half such an ellipse loses what comes after a pause; at double
+#: half a circle at 1.6 times the range would go on with the other half.
+_ONE_CIRCUIT_SHARE = 0.15
 #: Two passages of an aspect are in the same place within this share of range and height. A height is
 #: measured by its shadow in proportion to the sonar's: 3 % is 12 mm of 0.4 m, a third of a voxel of 4 cm.
 #: At half of it laps flown with 0.5 m of spread at 30 m differ, and a stamp must tell; at double a height may
@@ -354,9 +359,10 @@ class _Selection:
         if not inside.size:
             return s.last, s.first
         first, last = s.first + int(inside[0]), s.first + int(inside[-1])
-        if self._leads_round(first, s.first, s.sense):
+        within = self.xy[first : last + 1][self.kept[first : last + 1]]
+        if self._leads_round(first, s.first, s.sense, within):
             first = s.first
-        if self._leads_round(last, s.last, s.sense):
+        if self._leads_round(last, s.last, s.sense, within):
             last = s.last
         if first == s.first:
             while first - 1 > before and off[first - 1] <= tight:
@@ -379,11 +385,12 @@ class _Selection:
             last = self._without_repeat(last, first, s.sense, most)
         return first, last
 
-    def _leads_round(self, edge: int, end: int, sense: int) -> bool:
+    def _leads_round(self, edge: int, end: int, sense: int, within: FloatArray) -> bool:
         """Say whether the poses from the band's edge to a stretch's end go round, too: a circle that is none.
 
         An ellipse, a spiral, a vehicle that settles on its circle. A straight way past the circle does not
-        turn, a way straight at it has little arc, a lost pose is far away at once.
+        turn, a way straight at it has little arc, a lost pose is far away at once. What is far away after a
+        pause of the record goes on if one circle passes it and the positions within the band.
         """
         if edge == end:
             return True
@@ -392,8 +399,14 @@ class _Selection:
         steps = np.diff(self.xy[index], axis=0)
         lengths = np.hypot(steps[:, 0], steps[:, 1])
         gap = self.track.max_gap_rad * float(self.range[edge])
-        if not lengths.size or lengths.max() > max(_JUMP_STEPS * self.usual_m, gap):
+        if not lengths.size:
             return False
+        if lengths.max() > max(_JUMP_STEPS * self.usual_m, gap):
+            cut = int(lengths.argmax()) + 1
+            beyond = index[cut:] if end > edge else index[:cut]
+            if not _one_circuit(within, self.xy[beyond]):
+                return False
+            index, lengths = beyond, np.delete(lengths, np.s_[:cut] if end > edge else np.s_[cut - 1 :])
         aspect = np.unwrap(np.arctan2(self.xy[index, 1], self.xy[index, 0])) * sense
         arc = float(aspect[-1] - aspect[0])
         if arc * float(self.range[index].mean()) < _LEAST_TANGENTIAL * float(lengths.sum()):
@@ -736,11 +749,27 @@ def _fit(xy: FloatArray) -> _Circle:
     median, x0, y0, radius0 = best
     off = np.abs(np.hypot(some[:, 0] - x0, some[:, 1] - y0) - radius0)
     near = some[off <= 2.5 * 1.4826 * median + 1e-9 * radius0]
-    if len(near) >= 8:
-        design = np.column_stack([2.0 * near, np.ones(len(near))])
-        (p, q, w), *_ = np.linalg.lstsq(design, (near * near).sum(1), rcond=None)
-        r = math.sqrt(max(w + p * p + q * q, 0.0))
-        refined = float(np.median(np.abs(np.hypot(some[:, 0] - p, some[:, 1] - q) - r)))
-        if math.hypot(p, q) < 0.9 * r and refined <= 1.5 * median:
-            median, x0, y0, radius0 = refined, float(p), float(q), r
+    if len(near) >= 8 and (fitted := _least_squares(near)) is not None:
+        refined = float(np.median(np.abs(fitted.off(some))))
+        if refined <= 1.5 * median:
+            median, x0, y0, radius0 = refined, fitted.x_m, fitted.y_m, fitted.radius_m
     return _Circle(x0, y0, radius0, 1.4826 * median)
+
+
+def _least_squares(xy: FloatArray) -> _Circle | None:
+    """Fit a circle to positions (n, 2) by least squares; None if it does not go round the origin."""
+    design = np.column_stack([2.0 * xy, np.ones(len(xy))])
+    (p, q, w), *_ = np.linalg.lstsq(design, (xy * xy).sum(1), rcond=None)
+    radius = math.sqrt(max(w + p * p + q * q, 0.0))
+    return _Circle(float(p), float(q), radius, 0.0) if math.hypot(p, q) < 0.9 * radius else None
+
+
+def _one_circuit(a: FloatArray, b: FloatArray) -> bool:
+    """Say whether one circle passes two arcs of positions, to `_ONE_CIRCUIT_SHARE` of its radius."""
+    if min(len(a), len(b)) < 3:
+        return False
+    both = np.concatenate([a, b])
+    circle = _least_squares(both)
+    return circle is not None and bool(
+        np.abs(circle.off(both)).max() <= _ONE_CIRCUIT_SHARE * circle.radius_m
+    )

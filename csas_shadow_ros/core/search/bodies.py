@@ -216,8 +216,15 @@ class Look:
 
 
 def _search_looks(views: list[View], extent_m: float, workers: int = 2) -> list[Look]:
-    """Turn amplitude views into smoothed looks; empties the list, as both would be much memory."""
+    """Turn amplitude views into smoothed looks; empties the list, as both would be much memory.
+
+    Raises
+    ------
+    NoTargetError
+        If none of them can be: what the first one lacks.
+    """
     parameters = LikelihoodParameters(smoothing_m=_smoothing_m(extent_m, views[0].info.camera))
+    lacking: list[str] = []
 
     def look(_: int) -> Look | None:
         view = views.pop()
@@ -225,11 +232,15 @@ def _search_looks(views: list[View], extent_m: float, workers: int = 2) -> list[
             levels = view_levels(view, parameters, target=False)
             power = _power(view, levels, parameters, smoothing_px(extent_m, view.info.camera))
             return Look(outside_likelihood(view, parameters, levels), power)
-        except ViewError:
+        except ViewError as error:
+            lacking.append(str(error))
             return None  # a view without levels has nothing to say here; it is reported where it counts
 
     with ThreadPoolExecutor(workers) as pool:
-        return [found for found in pool.map(look, range(len(views))) if found is not None]
+        looks = [found for found in pool.map(look, range(len(views))) if found is not None]
+    if not looks:
+        raise NoTargetError(f"none of {len(lacking)} views can be searched: {lacking[0]}")
+    return looks
 
 
 def _smoothing_m(extent_m: float, camera: ShadowCamera) -> float:
@@ -752,9 +763,11 @@ def spectrum_sign_evidence(
     other_image = replace(image, acoustics=replace(image.acoustics, spectrum_sign=-sign))
     turned = list(_under_other_sign(looks, _searching(other_image, track, spectrum)))
     stated = _search(looks, camera, extent)
+    if not turned:  # of less than half a circle no view has its opposite: nothing tells the sign
+        return SignEvidence(sign, 0.0, 0.0), stated
+    best = stated.best.evidence if stated.best is not None else 0.0
     # What is only faint proves nothing before as much was looked for under the other sign.
     other = _search(turned, camera, extent, twice=stated.is_faint)
-    best = stated.best.evidence if stated.best is not None else 0.0
     if leaving := [left for left in other.left_out if left.reason.startswith(LEAVES)]:
         best = 0.0
         doubts = (replace(left, reason=f"{OTHER_SIGN} {left.reason}") for left in leaving)
