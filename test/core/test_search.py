@@ -14,8 +14,8 @@ from csas_shadow_ros.core.errors import NoTargetError, SpectrumSignError
 from csas_shadow_ros.core.imaging.subaperture import Spectrum
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.pipeline import run
-from csas_shadow_ros.core.search import detectable
-from csas_shadow_ros.core.search.bodies import search_image, spectrum_sign_evidence
+from csas_shadow_ros.core.search import bodies, detectable
+from csas_shadow_ros.core.search.bodies import Search, Thrown, cell_m, search_image, spectrum_sign_evidence
 from csas_shadow_ros.core.search.decision import decide
 from csas_shadow_ros.core.search.detectable import detectable_of
 from csas_shadow_ros.core.search.pieces import objects_of
@@ -274,3 +274,30 @@ def test_views_that_cannot_be_searched_are_an_error_that_names_why():
     dark = replace(made.image, pixels=np.zeros_like(made.image.pixels))
     with pytest.raises(NoTargetError, match=r"none of \d+ views can be searched: the seabed level"):
         search_image(dark, made.track, Spectrum.of_image(dark))
+
+
+@pytest.mark.parametrize(
+    ("length_cells", "front", "verdict"),
+    [(3.0, 1.0, "wrong"), (3.0, np.nan, "wrong"), (1.2, 1.0, "unknown"), (3.0, 0.4, "unknown")],
+    ids=["a body", "a body at the edge", "a patch in shifted views", "a patch with soft edges"],
+)
+def test_only_a_shadow_that_is_one_sided_and_long_tells_a_wrong_sign(
+    monkeypatch, length_cells, front, verdict
+):
+    made = simulate("tiny", "empty", seed=2)
+    searches = []
+
+    def search(looks, camera, extent_m, *, twice=True):
+        searches.append(looks)
+        nothing = Search((), None, None)
+        if len(searches) == 1:
+            return nothing
+        thrown = Thrown(length_cells * cell_m(looks), 0.2, 0.16, front)
+        return replace(nothing, targets=(Target(PLACE, (0.4, 0.4, 0.2), 1e-4),), thrown=(thrown,))
+
+    monkeypatch.setattr(bodies, "_search", search)
+    evidence, stated = spectrum_sign_evidence(made.image, made.track)
+    assert len(searches) == 2
+    assert evidence.verdict == verdict
+    # What does not tell it is a candidate.
+    assert any("falls towards the sonar" in left.reason for left in stated.left_out) == (verdict != "wrong")

@@ -95,6 +95,10 @@ _THROWN_CELLS = 1.0
 #: 8 to 30 cm have 1.65 to 1.8 there, bodies 1.0 to 1.6, of which bright flanks seen steeply are the most. At
 #: half no body tells a wrong sign; at double hollows do.
 _PLAIN = 1.5
+#: And they throw their shadow so far (resolution cells of a view of the search). Seabed whose views are
+#: shifted by 1.5 cells towards the sonar, or away from it, seems to throw its dark patches' shadows. At half
+#: one of 84 seabeds of the development half (scenes 120 to 330) is refused, with a patch of 13 dB.
+_CONTRARY_CELLS = 2.0
 #: The other sign must explain this many times more body than the stated one to be called the right one.
 _SIGN_RATIO = 4.0
 
@@ -154,6 +158,11 @@ class Thrown:
     def contrast_db(self) -> float:
         """Contrast of the core below the seabed."""
         return -10.0 * math.log10(max(self.core, 1e-3))
+
+    @property
+    def is_one_sided(self) -> bool:
+        """Whether it is not as dark before the body as behind it, as on dark sediment with soft edges."""
+        return not (self.front - self.core) / max(1.0 - self.core, 1e-3) < _NOT_CAST
 
 
 @dataclass(frozen=True, eq=False)
@@ -772,10 +781,11 @@ def spectrum_sign_evidence(
         best = 0.0
         doubts = (replace(left, reason=f"{OTHER_SIGN} {left.reason}") for left in leaving)
         stated = replace(stated, left_out=(*stated.left_out, *doubts))
+    least_m = _CONTRARY_CELLS * cell_m(looks)
     contrary = [
         target
         for target, thrown in zip(other.targets, other.thrown, strict=True)
-        if not thrown.front >= _PLAIN
+        if not thrown.front >= _PLAIN and thrown.is_one_sided and not thrown.length_m < least_m
     ]
     against = max((target.evidence for target in contrary), default=0.0)
     if faint := stated.is_faint and other.is_faint:
