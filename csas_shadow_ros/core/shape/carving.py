@@ -813,7 +813,7 @@ class Carver:
         """Say whether less than a share of a body's views contradicts most of some voxels."""
         with np.errstate(invalid="ignore"):
             seldom = ~(body.likelihood[voxels] >= share)
-        return float(seldom.mean()) > 0.5
+        return bool(seldom.size) and float(seldom.mean()) > 0.5
 
     def misfit(self, bodies: Sequence[VoxelGrid]) -> tuple[float, float]:
         """Return how badly bodies fit the silhouettes, their own body's first: mean `unexplained` and `lit`.
