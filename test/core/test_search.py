@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,14 @@ from csas_shadow_ros.core.imaging.subaperture import Spectrum
 from csas_shadow_ros.core.parameters import PipelineParameters, SubApertureParameters, TargetParameters
 from csas_shadow_ros.core.pipeline import run
 from csas_shadow_ros.core.search import bodies, detectable
-from csas_shadow_ros.core.search.bodies import Search, Thrown, cell_m, search_image, spectrum_sign_evidence
+from csas_shadow_ros.core.search.bodies import (
+    Judged,
+    Search,
+    Thrown,
+    cell_m,
+    search_image,
+    spectrum_sign_evidence,
+)
 from csas_shadow_ros.core.search.decision import decide
 from csas_shadow_ros.core.search.detectable import detectable_of
 from csas_shadow_ros.core.search.pieces import objects_of
@@ -301,3 +309,22 @@ def test_only_a_shadow_that_is_one_sided_and_long_tells_a_wrong_sign(
     assert evidence.verdict == verdict
     # What does not tell it is a candidate.
     assert any("falls towards the sonar" in left.reason for left in stated.left_out) == (verdict != "wrong")
+
+
+@pytest.mark.parametrize(("front", "found"), [(1.3, True), (0.8, True), (np.nan, True), (0.35, False)])
+def test_what_is_as_dark_before_it_as_behind_it_is_sediment_or_stands_on_it(front, found):
+    made = simulate("tiny", "empty", seed=2)
+    looks = search_image(made.image, made.track, Spectrum.of_image(made.image)).looks
+    thrown = Thrown(3.0 * cell_m(looks), 0.25, 0.2, front)
+    body = SimpleNamespace(
+        target=lambda: Target(PLACE, (0.4, 0.4, 0.2), 1e-3),
+        thrown=lambda looks: thrown,
+        voxels=(np.arange(2), np.arange(2), np.arange(2)),
+    )
+    judged = Judged()
+    judged.add(body, looks)
+    assert judged.stands == found
+    # Over the local seabed it is looked for again.
+    assert bool(judged.plans) == found
+    assert [left.strong for left in judged.left_out] == [True] * (not found)
+    assert all("sediment, or a body on it" in left.reason for left in judged.left_out)

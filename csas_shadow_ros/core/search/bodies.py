@@ -161,8 +161,13 @@ class Thrown:
 
     @property
     def is_one_sided(self) -> bool:
-        """Whether it is not as dark before the body as behind it, as on dark sediment with soft edges."""
-        return not (self.front - self.core) / max(1.0 - self.core, 1e-3) < _NOT_CAST
+        """Whether it is not as dark before the body as where a shadow falls: so is dark sediment.
+
+        Of the bodies found in scenes 0 to 119 of the development half none has less than 0.5 there (the
+        core's power 0, the seabed's 1), all but one more than 0.8. Four dark patches that were taken for
+        bodies, in scenes 109 to 379, have 0.2 to 0.3.
+        """
+        return not (self.front - self.core) / max(1.0 - self.core, 1e-3) <= _CAST
 
 
 @dataclass(frozen=True, eq=False)
@@ -498,6 +503,11 @@ class Judged:
         cell = cell_m(looks)
         if faint and (thrown.length_m < least_cells * cell or not thrown.power < _NOT_CAST):
             return  # texture of the seabed, which every scene has
+        if thrown.power <= _CAST and not thrown.is_one_sided:
+            # Over the local seabed a body on dark sediment may still stand out.
+            told = f"dark by {thrown.contrast_db:.0f} dB, before it as where its shadow must fall"
+            self.left_out.append(LeftOut((x, y), f"{told}: sediment, or a body on it", strong=True))
+            return
         self.plans.append(body.voxels[1:])
         if not target.stands and not faint:
             self.found.append((target, thrown, faint))
