@@ -158,7 +158,10 @@ def test_a_run_over_a_slope_is_carved_as_over_a_level(level_and_tilted):
     leaning = carver.first_look().occupied
     assert agreement > 0.93
     assert agreement > (a & leaning).sum() / (a | leaning).sum() + 0.03
-    assert tilted.dimensions.height_m == pytest.approx(level.dimensions.height_m, abs=0.02)
+    # Where no shadow tells the height, it is as uncertain as its interval says.
+    for one, other in ((level, tilted), (tilted, level)):
+        low, high = one.dimensions.intervals["height_m"]
+        assert low < other.dimensions.height_m < high < low + 0.25
     # What is measured beside the grid stands over the same seabed.
     heights = [side.info.camera.sonar_m[2] for side in tilted.sides]
     told = [mask.info.camera.sonar_m[2] for mask in masks]
