@@ -224,6 +224,20 @@ def test_a_body_that_carving_loses_beside_an_object_is_named_as_a_candidate(box_
     assert result.quality.reasons[0].startswith("a candidate at (3.00, -4.00) m: ")
 
 
+def test_a_target_that_carving_loses_beside_another_object_is_named_as_a_candidate(box_run):
+    result = run(box_run.image, box_run.track, COARSE)
+    (found,) = result.objects
+    result.target = replace(result.target, position_m=(3.0, -4.0))
+    nothing = np.zeros_like(result.grid.occupied)
+    result.grid, result.mesh, result.dimensions = replace(result.grid, occupied=nothing), None, None
+    result.further = [found]
+
+    judge(result)
+
+    assert (result.verdict, result.quality.verdict) == ("object", "limited")
+    assert result.quality.reasons[0].startswith("a candidate at (3.00, -4.00) m: its shadow is too thin")
+
+
 def test_a_body_with_gaps_is_no_sediment():
     frame = simulate("tiny", "frame", seed=3, position_m=PLACE)
     search = search_image(frame.image, frame.track, Spectrum.of_image(frame.image))

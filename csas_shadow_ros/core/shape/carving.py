@@ -76,7 +76,7 @@ _LOST = 0.5
 #: Four empty seabeds of the development half have a phantom that leaves 0.53, 0.62, 0.82 and 0.90, and two
 #: bodies of 6 dB are shown so that leave 0.54 (IoU with the hull 0.31) and 0.76 (0.00). At 0.5 all six are
 #: candidates. At double nothing is.
-_NOTHING = 0.75
+_EXPLAINS_NOTHING = 0.75
 #: Or they took so much from under the body (share of its voxels) at least. At half nothing changes, at double
 #: a keg loses 0.09.
 _UNDERCUT = 0.1
@@ -834,7 +834,7 @@ class Carver:
         Where carving left nothing, the other grid is a body unless it explains hardly any of its shadow.
         """
         if not body.occupied.any():
-            return not self.misfit([instead, *others])[0] > _NOTHING
+            return not self.misfit([instead, *others])[0] > _EXPLAINS_NOTHING
         unexplained, lit = self.misfit([body, *others])
         if not unexplained > _LOST:
             return False

@@ -199,7 +199,8 @@ def _candidates(result: Result) -> list[str]:
     ]
     target = result.target
     # A volume that was given tells nothing of a shadow in it; one that the search found does.
-    if not result.objects and target is not None and result.final and not math.isnan(target.evidence):
+    lost = result.mesh is None and result.final
+    if lost and target is not None and not math.isnan(target.evidence):
         found.insert(
             0,
             f"a candidate at {place_text(target.position_m)}: its shadow is too thin or too faint to carve"
