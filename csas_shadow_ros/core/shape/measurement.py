@@ -809,10 +809,8 @@ def measure_object(
         solid = _without_thin_parts(grid, _THIN_CELLS * across)
         plan = _rectangle(_voxel_support(solid, fit.directions), np.zeros(2))
     aperture = float(np.median([side.info.aperture_rad for side in sides]))
-    doubts = [
-        across * doubt_cells(*apart, plan.heading_rad + turn, aperture) for turn in (0.0, math.pi / 2.0)
-    ]
-    intervals = _plan_intervals(plan, resampled, edge, (doubts[0], doubts[1]))
+    along, beside = (across * doubt_cells(*apart, plan.heading_rad + t, aperture) for t in (0.0, math.pi / 2))
+    intervals = _plan_intervals(plan, resampled, edge, (along, beside))
     cap = cap_of(grid, grazing)
     sigma = math.hypot(d / 2.0, down * math.tan(grazing))
     measured = replace(
@@ -831,18 +829,21 @@ def measure_object(
         height, sigma = told.height_m, math.hypot(told.sigma_m, d / 2.0)
     elif height is None:
         # Flat or round: half-way. The true top lies anywhere in the cap, or where half of the views end.
-        # A flat top says by how abruptly its cap begins that half of the views err there.
-        one_cell = down * math.tan(grazing)
-        rounded = (cap.dome_m - cap.begins_m + one_cell) / (cap.top_m - cap.begins_m + one_cell)
-        tip = _TIP_SHARE * min(rounded, 1.0) * (cap.half_m - cap.top_m)
-        middle = 0.5 * (cap.begins_m + cap.dome_m) + tip
-        height = standing_height(sides, measured, grid, sigma) or middle
+        height = standing_height(sides, measured, grid, sigma) or _cap_height(cap, down * math.tan(grazing))
         sigma = math.hypot(sigma, max(cap.half_m - height, height - cap.begins_m, 0.0) / _SIGMAS_95)
     intervals["height_m"] = (max(0.0, height - _SIGMAS_95 * sigma), height + _SIGMAS_95 * sigma)
     # A surface that lies wrong by one error everywhere.
     change = float(mesh.area) * math.hypot(edge / 2.0, d / 4.0)
     intervals["volume_m3"] = (max(0.0, whole.volume_m3 - change), whole.volume_m3 + change)
     return replace(measured, height_m=height, intervals=intervals, scatter_cells=spread_m / across)
+
+
+def _cap_height(cap: Cap, cell_m: float) -> float:
+    """Return the height (m) that a cap tells, between flat and round; a cell of shadow is `cell_m` high."""
+    # A flat top says by how abruptly its cap begins that half of the views err there.
+    rounded = (cap.dome_m - cap.begins_m + cell_m) / (cap.top_m - cap.begins_m + cell_m)
+    tip = _TIP_SHARE * min(rounded, 1.0) * (cap.half_m - cap.top_m)
+    return 0.5 * (cap.begins_m + cap.dome_m) + tip
 
 
 def sides_apart(sides: Sequence[SilhouetteSides]) -> float:
