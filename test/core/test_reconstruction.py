@@ -92,15 +92,20 @@ def test_silhouettes_alone_are_measured_by_themselves(whole):
     assert found.dimensions.length_m == pytest.approx(result.dimensions.length_m, abs=cell_m)
 
 
-def test_what_silhouettes_are_too_little_for_is_carved_from_the_mean_likelihood(whole):
+def with_silhouettes_apart(whole, columns):
+    """Reconstruct a run again from silhouettes that no two views agree on."""
     result, views = whole
     again = Reconstruction(replace(result.decision, others=()), COARSE, compose=False)
     for number, view in enumerate(views):
-        # Speckle: silhouettes that no two views agree on.
-        shift = (-12, 12)[number % 2]
+        shift = (-columns, columns)[number % 2]
         mask = replace(view.mask, pixels=np.roll(view.mask.pixels, shift, axis=1))
         again.add(ProcessedView(result.target, COARSE, shadow_mask=mask, likelihood=view.likelihood))
-    found = again.result()
+    return again.result()
+
+
+def test_what_silhouettes_are_too_little_for_is_carved_from_the_mean_likelihood(whole):
+    result, _ = whole
+    found = with_silhouettes_apart(whole, 12)  # as of speckle
     assert not found.other_grid.occupied.any()
     assert found.grid.method == "soft"
     assert np.array_equal(found.grid.occupied, result.other_grid.occupied)
@@ -144,14 +149,7 @@ def test_a_volume_that_cuts_the_object_is_told(whole):
 
 
 def test_a_mean_likelihood_that_explains_little_of_the_shadow_is_no_object(whole):
-    result, views = whole
-    again = Reconstruction(replace(result.decision, others=()), COARSE, compose=False)
-    for number, view in enumerate(views):
-        # Silhouettes that no two views agree on, far from what is dark on the mean.
-        shift = (-40, 40)[number % 2]
-        mask = replace(view.mask, pixels=np.roll(view.mask.pixels, shift, axis=1))
-        again.add(ProcessedView(result.target, COARSE, shadow_mask=mask, likelihood=view.likelihood))
-    found = again.result()
+    found = with_silhouettes_apart(whole, 40)  # far from what is dark on the mean
     assert not found.grid.occupied.any()
     assert found.verdict == "undecided"
     assert "too thin or too faint to carve" in found.quality.reasons[0]

@@ -402,11 +402,12 @@ class _Selection:
         if not lengths.size:
             return False
         if lengths.max() > max(_JUMP_STEPS * self.usual_m, gap):
+            # On the far side of the pause.
             cut = int(lengths.argmax()) + 1
-            beyond = index[cut:] if end > edge else index[:cut]
-            if not _one_circuit(within, self.xy[beyond]):
+            ahead = end > edge
+            index, lengths = (index[cut:], lengths[cut:]) if ahead else (index[:cut], lengths[: cut - 1])
+            if not _one_circuit(within, self.xy[index]):
                 return False
-            index, lengths = beyond, np.delete(lengths, np.s_[:cut] if end > edge else np.s_[cut - 1 :])
         aspect = np.unwrap(np.arctan2(self.xy[index, 1], self.xy[index, 0])) * sense
         arc = float(aspect[-1] - aspect[0])
         if arc * float(self.range[index].mean()) < _LEAST_TANGENTIAL * float(lengths.sum()):

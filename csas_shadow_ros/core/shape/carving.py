@@ -400,52 +400,35 @@ class _Sums:
 
     def add_image(self, image: NDArray[np.float32], info: ViewInfo) -> None:
         """Add an image, NaN where unknown, at every voxel's shadow pixel."""
-        v = self._volume
-        affines = _slice_affines(info, v)
-
-        def work(first: int, last: int) -> None:
-            _carve_slices(
-                image,
-                affines,
-                v.origin_m[0],
-                v.origin_m[1],
-                v.voxel_size_m,
-                first,
-                last,
-                self._total,
-                self._count,
-            )
-
-        _threads(self._pool, work, v.shape[0])
+        self._in_slices(_carve_slices, image, _slice_affines(info, self._volume))
 
     def add_mask(self, pixels: NDArray[np.uint8], info: ViewInfo, echo: NDArray[np.bool_] = _NOWHERE) -> None:
         """Add a mask: 1 outside the silhouette, 0 inside; covered pixels are outside except in `echo`."""
-        v = self._volume
-        affines = _slice_affines(info, v)
-        first, shape = _part_of_image(affines, v, pixels.shape)
+        affines, first, shape = self._onto(info, pixels.shape)
         if min(shape) < 2:
             return
-        # The affines count from the part's own corner.
-        affines[:, :, 2] -= first[::-1]
         cells = np.empty(shape, np.uint8)
         sums = np.zeros((shape[0] + 1, shape[1] + 1), np.uint32)
         _cells_of_mask(pixels, echo, first, cells, sums)
+        blocks = self._block_total, self._block_count
+        self._in_slices(_carve_masks, cells, sums, affines, blocks=blocks)
+
+    def _onto(
+        self, info: ViewInfo, shape: tuple[int, ...]
+    ) -> tuple[NDArray[np.float64], tuple[int, int], tuple[int, int]]:
+        """Return the slices' affines onto the part of an image that shadows fall on, its corner and shape."""
+        affines = _slice_affines(info, self._volume)
+        first, part = _part_of_image(affines, self._volume, shape)
+        affines[:, :, 2] -= first[::-1]  # they count from the part's own corner
+        return affines, first, part
+
+    def _in_slices(self, carve: Any, *given: Any, blocks: tuple[Any, ...] = ()) -> None:
+        """Let a kernel add to all slices, the lower and the upper half at the same time."""
+        v = self._volume
 
         def work(first: int, last: int) -> None:
-            _carve_masks(
-                cells,
-                sums,
-                affines,
-                v.origin_m[0],
-                v.origin_m[1],
-                v.voxel_size_m,
-                first,
-                last,
-                self._total,
-                self._count,
-                self._block_total,
-                self._block_count,
-            )
+            place = v.origin_m[0], v.origin_m[1], v.voxel_size_m
+            carve(*given, *place, first, last, self._total, self._count, *blocks)
 
         _threads(self._pool, work, v.shape[0])
 
@@ -472,16 +455,13 @@ class _Sums:
         at = _box_of(changed)
         if at is None:
             return
-        v = self._volume
-        affines = _slice_affines(info, v)
-        first, shape = _part_of_image(affines, v, before.shape)
+        affines, first, shape = self._onto(info, before.shape)
         # The cells of which a pixel differs, as far as shadows of the volume fall.
         begin = np.maximum(np.array(at[0]) - 1, first)
         end = np.minimum(np.array(at[1]) + 1, np.array(first) + shape)
         size = tuple(map(int, end - begin))
         if min(shape) < 2 or min(size) < 2:
             return
-        affines[:, :, 2] -= first[::-1]
         corner = int(begin[0]), int(begin[1])
         cells = []
         for mask, zone in ((before, _NOWHERE), (after, echo)):
@@ -493,25 +473,7 @@ class _Sums:
         differ = np.zeros(size, np.int32)
         np.cumsum(np.cumsum(old != new, axis=0, dtype=np.int32), axis=1, out=differ[1:, 1:])
         offset = corner[0] - first[0], corner[1] - first[1]
-
-        def work(first: int, last: int) -> None:
-            _carve_changes(
-                old,
-                new,
-                differ,
-                offset,
-                shape,
-                affines,
-                v.origin_m[0],
-                v.origin_m[1],
-                v.voxel_size_m,
-                first,
-                last,
-                self._total,
-                self._count,
-            )
-
-        _threads(self._pool, work, v.shape[0])
+        self._in_slices(_carve_changes, old, new, differ, offset, shape, affines)
 
     @property
     def total(self) -> NDArray[np.int32]:
