@@ -53,7 +53,7 @@ _SPREADS, _TIGHT_SHARE, _BAND_SHARE = 6.0, 0.01, 0.05
 #: What comes after a pause of the record goes on with the circle if one circle passes both within this share
 #: of its radius. An ellipse whose axes differ by 16 % lies within 8 % of its circle, but the circle of one
 #: half of it is 40 % off the other's end. At half such an ellipse loses what comes after a pause; at double
-#: half a circle at 1.6 times the range would go on with the other half.
+#: half a circle at 1.6 times the range would go on with the other half. Both are reasoned.
 _ONE_CIRCUIT_SHARE = 0.15
 #: Two passages of an aspect are in the same place within this share of range and height. A height is
 #: measured by its shadow in proportion to the sonar's: 3 % is 12 mm of 0.4 m, a third of a voxel of 4 cm.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import TWO_PI
+from ..geometry import TWO_PI, wrap_angle
 
 if TYPE_CHECKING:
     from .measurement import SilhouetteSides
@@ -58,7 +58,7 @@ def opposed_sides(sides: Sequence[SilhouetteSides], support_m: FloatArray) -> tu
     within = _WITHIN * np.array([side.info.aperture_rad for side in sides for _ in side.direction_rad])
     cell_m = float(np.median([side.info.resolution_m[1] for side in sides]))
     for n, direction in enumerate(directions):
-        near = np.abs(np.mod(phi - direction + math.pi, TWO_PI) - math.pi) <= within + 1e-9
+        near = np.abs(wrap_angle(phi - direction)) <= within + 1e-9
         near &= np.isfinite(support_m)
         seen = [support_m[near & (right == from_right)] for from_right in (True, False)]
         if min(map(len, seen)) >= _LEAST:
