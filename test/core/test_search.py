@@ -342,3 +342,24 @@ def test_what_is_as_dark_before_it_as_behind_it_is_sediment_or_stands_on_it(fron
     assert bool(judged.plans) == found
     assert [left.strong for left in judged.left_out] == [True] * (not found)
     assert all("sediment, or a body on it" in left.reason for left in judged.left_out)
+
+
+@pytest.mark.parametrize(("length_cells", "front"), [(3.0, 1.0), (1.2, 1.0), (3.0, 0.4)])
+def test_what_is_faint_raises_a_doubt_of_the_sign_even_where_it_would_prove_nothing(
+    monkeypatch, length_cells, front
+):
+    made = simulate("tiny", "empty", seed=2)
+    searches = []
+
+    def search(looks, camera, extent_m, *, twice=True):
+        searches.append(looks)
+        nothing = Search((), None, None, is_faint=True)
+        if len(searches) == 1:
+            return nothing
+        thrown = Thrown(length_cells * cell_m(looks), 0.2, 0.16, front)
+        return replace(nothing, targets=(Target(PLACE, (0.4, 0.4, 0.2), 1e-4),), thrown=(thrown,))
+
+    monkeypatch.setattr(bodies, "_search", search)
+    evidence, stated = spectrum_sign_evidence(made.image, made.track)
+    assert evidence.verdict == "unknown"
+    assert ["a faint body throws a shadow here" in left.reason for left in stated.left_out] == [True]

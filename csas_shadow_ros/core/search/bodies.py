@@ -792,16 +792,18 @@ def spectrum_sign_evidence(
         doubts = (replace(left, reason=f"{OTHER_SIGN} {left.reason}") for left in leaving)
         stated = replace(stated, left_out=(*stated.left_out, *doubts))
     least_m = _CONTRARY_CELLS * cell_m(looks)
-    contrary = [
-        target
+    # A hollow tells nothing; what is short, or dark before it too, raises a doubt and proves nothing.
+    plain = [
+        (target, thrown.is_one_sided and not thrown.length_m < least_m)
         for target, thrown in zip(other.targets, other.thrown, strict=True)
-        if not thrown.front >= _PLAIN and thrown.is_one_sided and not thrown.length_m < least_m
+        if not thrown.front >= _PLAIN
     ]
+    contrary = [target for target, proves in plain if proves]
     against = max((target.evidence for target in contrary), default=0.0)
     if faint := stated.is_faint and other.is_faint:
         # What is faint proves no sign wrong. It raises a doubt where the search names nothing else.
-        if against > _SIGN_RATIO * best and not stated.left_out:
-            body = max(contrary, key=lambda target: target.evidence)
+        body = max((target for target, _ in plain), key=lambda target: target.evidence, default=None)
+        if body is not None and body.evidence > _SIGN_RATIO * best and not stated.left_out:
             doubt = LeftOut(body.position_m, f"{OTHER_SIGN} a faint body throws a shadow here")
             stated = replace(stated, left_out=(*stated.left_out, doubt))
         against = min(against, best)
