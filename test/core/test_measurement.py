@@ -335,6 +335,21 @@ def test_the_height_is_where_the_cap_begins(half_m):
     assert cap_of(grid_of(occupied), GRAZING).begins_m == pytest.approx(cap.begins_m, abs=1e-9)
 
 
+@pytest.mark.parametrize("hole_m", [0.0, 0.05, 0.3])
+def test_speckle_that_holes_a_low_top_does_not_lift_where_its_cap_begins(hole_m):
+    z, y, x = np.meshgrid(VOLUME.z_m, VOLUME.y_m, VOLUME.x_m, indexing="ij")
+    inside = 0.3 - np.hypot(x, y)
+    occupied = (inside > 0) & (z < 0.1 + math.tan(GRAZING) * np.maximum(inside, 0.0))
+    hole = (np.hypot(x, y) < hole_m / 2.0) & (z < 0.1 + math.tan(GRAZING) * 0.15)
+    begins = [cap_of(grid_of(occupied & ~hole), GRAZING, room).begins_m for room in (0.0, 0.05)]
+    d = VOLUME.voxel_size_m
+    if hole_m == 0.05:
+        assert begins[0] > 0.1 + 2.0 * d  # its layers would be as thin as the ring round the hole
+        assert begins[1] == pytest.approx(0.1, abs=0.75 * d)
+    else:  # what is wider than two cells is a hollow
+        assert begins[1] == begins[0]
+
+
 def test_a_tip_that_views_cut_each_at_its_height_is_as_high_as_half_of_them_say():
     z, y, x = np.meshgrid(VOLUME.z_m, VOLUME.y_m, VOLUME.x_m, indexing="ij")
     # A cone; of 90 views each keeps it up to a height of its own.

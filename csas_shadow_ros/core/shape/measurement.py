@@ -115,6 +115,9 @@ _CAP_SLACK = (0.2, 0.3)
 #: nothing of the cap: one voxel too many on its tip lifts where it begins by two layers (a box of 0.40 m:
 #: 0.46 m for 0.42 m). A pole's layers are all as thin.
 _CAP_TIP, _CAP_TIP_SHARE = 2.0, 1.0 / 3.0
+#: A hole in a layer of up to this radius (cross-range cells) is speckle: in the middle of a low top it makes
+#: the layer as thin as what is round it, and the cap seems to begin at its own top. HOLEFIG
+_HOLE_CELLS = 1.0
 #: How gradually it begins tells a dome: between these two, voxels under the cap's top.
 _DOME_SLACK = (0.5, 2.0)
 #: Carving keeps of a top what nearly all views keep, and views scatter. Half of them keep more, on the
@@ -596,7 +599,7 @@ class Cap:
     half_m: float
 
 
-def cap_of(grid: VoxelGrid, grazing_rad: float) -> Cap:
+def cap_of(grid: VoxelGrid, grazing_rad: float, hole_m: float = 0.0) -> Cap:
     """Find the cap that carving leaves on the top of a shape.
 
     Parameters
@@ -605,6 +608,8 @@ def cap_of(grid: VoxelGrid, grazing_rad: float) -> Cap:
         Carved grid with an object.
     grazing_rad : float
         ψ: a layer of inscribed radius R carries a cap tan ψ · R high.
+    hole_m : float
+        Holes in a layer that are less than twice as wide are speckle, m.
 
     Notes
     -----
@@ -616,9 +621,7 @@ def cap_of(grid: VoxelGrid, grazing_rad: float) -> Cap:
     d = grid.volume.voxel_size_m
     layers = np.flatnonzero(grid.occupied.any(axis=(1, 2)))
     faces = grid.volume.z_m[layers] + d / 2.0
-    inside = np.empty(len(layers))
-    for n, k in enumerate(layers):
-        inside[n] = float(scipy.ndimage.distance_transform_edt(np.pad(grid.occupied[k], 1)).max())
+    inside = np.array([_inscribed(grid.occupied[k], hole_m / d) for k in layers])
     reach = faces + math.tan(grazing_rad) * (inside - 0.5) * d
     top = float(reach[inside >= min(_CAP_TIP, _CAP_TIP_SHARE * inside.max())].max())
 
@@ -642,6 +645,18 @@ def cap_of(grid: VoxelGrid, grazing_rad: float) -> Cap:
         float(faces[-1]),
         float(faces[-1]) + _kept_above(grid, int(layers[-1])),
     )
+
+
+def _inscribed(layer: NDArray[np.bool_], room: float) -> float:
+    """Return the radius (voxels) of the largest circle in a layer, holes of a radius up to `room` filled."""
+    padded = np.pad(layer, 1)
+    holes, count = scipy.ndimage.label(~padded)
+    if room > 0.0 and count > 1:
+        radius = scipy.ndimage.maximum(scipy.ndimage.distance_transform_edt(~padded), holes, range(count + 1))
+        small = np.asarray(radius) <= room
+        small[[0, holes[0, 0]]] = False  # the layer itself, and what is round it
+        padded |= small[holes]
+    return float(scipy.ndimage.distance_transform_edt(padded).max())
 
 
 def _kept_above(grid: VoxelGrid, last: int) -> float:
@@ -811,7 +826,7 @@ def measure_object(
     aperture = float(np.median([side.info.aperture_rad for side in sides]))
     along, beside = (across * doubt_cells(*apart, plan.heading_rad + t, aperture) for t in (0.0, math.pi / 2))
     intervals = _plan_intervals(plan, resampled, edge, (along, beside))
-    cap = cap_of(grid, grazing)
+    cap = cap_of(grid, grazing, _HOLE_CELLS * across)
     sigma = math.hypot(d / 2.0, down * math.tan(grazing))
     measured = replace(
         whole,
