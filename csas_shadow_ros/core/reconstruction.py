@@ -28,7 +28,7 @@ from .imaging.masks import KeptMask
 from .imaging.segmentation import require_silhouette
 from .parameters import PipelineParameters
 from .search.decision import Decision
-from .search.pieces import APART_CELLS, nothing_left, objects_of, without_neighbours
+from .search.pieces import APART_CELLS, is_same_body, nothing_left, objects_of, without_neighbours
 from .shape.carving import Carver, compared_shadows
 from .shape.explained import ShadowFit, mean_fit
 from .shape.hollows import EchoLook, matter_mesh, matter_of
@@ -184,10 +184,15 @@ class Body:
     ) -> tuple[VoxelGrid, VoxelGrid | None]:
         """Return what was carved with what only lit pixels on its own plan took (`Carver.given_back`).
 
-        Where that still leaves most of its shadow unexplained, the mean likelihood tells what is there.
+        Where that still leaves most of its shadow unexplained, the mean likelihood tells what is there; or
+        what carving leaves on its plan, if that fits the shadows better (`Carver.on_plan_of`).
         """
         own, other = self._own_first(carved)
-        return self._told(self.carver.given_back(own, others), other, others)
+        told = self._told(self.carver.given_back(own, others), other, others)
+        if (told[0].occupied.any() and told[0] is not other) or not self.carver.keeps_masks:
+            return told
+        mended = self.carver.on_plan_of(self.target, told[0], others)
+        return told if mended is None else (mended, other)
 
     def _own_first(
         self, told: tuple[VoxelGrid, VoxelGrid | None]
@@ -311,7 +316,8 @@ class Reconstruction:
         if own.given_up:
             return False
         fresh = own.add(view, parts)
-        if body and fresh and self.most_views and len(own.carver.stamps) % _LOOK_EVERY == 0:
+        looks = len(own.carver.stamps) % _LOOK_EVERY == 0
+        if body and fresh and self.most_views and looks and not own.target.stands:
             own.given_up = own.carver.hopeless(self.most_views)
             return True
         pixels = view.mask if "mask" in parts else view.likelihood
@@ -565,14 +571,26 @@ class Reconstruction:
         for n, (grid, _) in shapes.items():
             told = [one for found in objects.values() for one in found]
             objects[n] = objects_of(grid, self.bodies[n].target.position_m, told)[0] if n else [grid]
-        # What falls to pieces, or is a phantom in part, gets no more: shadows of others would ask for it.
+        # What is lost or falls to pieces comes first: where it is mended, it is one more body for the others.
         whole = [n for n, found in objects.items() if any(one is shapes[n][0] for one in found)]
-        others = {n: [one for m, found in objects.items() if m != n for one in found] for n in whole}
-        for n in whole:
-            if others[n]:
-                shapes[n] = usable[n].beside(shapes[n], others[n])
-            shapes[n] = usable[n].given_back(shapes[n], others[n])
+        lost = [n for n in shapes if n not in whole and not self._told_before(shapes[n][0], objects, n)]
+        for n in lost + whole:
+            others = [one for m, found in objects.items() if m != n for one in found]
+            again = usable[n].beside(shapes[n], others) if others else shapes[n]
+            again = usable[n].given_back(again, others)
+            if n not in whole:
+                mended = objects_of(again[0], self.bodies[n].target.position_m, others)[0]
+                if not (len(mended) == 1 and mended[0] is again[0]):
+                    continue  # shadows of others would ask for ever more of it
+                objects[n] = mended
+            shapes[n] = again
         return shapes
+
+    @staticmethod
+    def _told_before(grid: VoxelGrid, objects: Mapping[int, Sequence[VoxelGrid]], number: int) -> bool:
+        """Say whether what was carved for a body is, or holds, another body."""
+        others = [one for n, found in objects.items() if n != number for one in found]
+        return not objects[number] and any(is_same_body(grid, one) for one in others)
 
     def _without_neighbours(
         self, told: tuple[VoxelGrid, VoxelGrid | None]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from core_data import hidden_by_box, iou, make_info, perfect_views
 
-from csas_shadow_ros.core.geometry import View
+from csas_shadow_ros.core.geometry import View, unit_to_sonar
 from csas_shadow_ros.core.imaging.mask_codes import MASK_OUTSIDE, MASK_SHADOW
 from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameters, SubApertureParameters
 from csas_shadow_ros.core.pipeline import run
@@ -16,12 +17,11 @@ from csas_shadow_ros.core.shape.carving import Carver, carve
 from csas_shadow_ros.core.shape.layover import layover_per_metre
 from csas_shadow_ros.core.shape.plan import (
     ShadowSides,
-    echo_of_plan,
-    on_plan,
+    StandingPlan,
     plan_of_sides,
     shadow_sides,
 )
-from csas_shadow_ros.core.shape.volume import Volume
+from csas_shadow_ros.core.shape.volume import Target, Volume
 from csas_shadow_ros.simulation import Faults, Profile, shadow_hull, simulate
 from csas_shadow_ros.simulation.bodies import brick, convex
 from csas_shadow_ros.simulation.targets import join_bodies
@@ -75,6 +75,16 @@ def carved(mesh, monkeypatch):
         simulated.truth.target, simulated.truth.sonar_m[::3], grid.volume, spacing_m=VOXEL_M / 8.0
     )
     return grid, bare[0], hull
+
+
+@pytest.mark.parametrize("size_m", [(2.0, 1.8, 0.4), (1.6, 1.5, 0.3)])
+def test_a_low_wide_body_of_which_the_search_sees_little_is_carved_whole(size_m, monkeypatch):
+    """Half as wide a volume is what all its shadows cross in."""
+    grid, bare, hull = carved(brick(size_m, (0.0, 0.0, 0.0)), monkeypatch)
+    assert not bare.occupied.any()
+    assert bare.volume.size_m[0] < size_m[0]
+    assert grid.method == "consensus"
+    assert iou(grid.occupied, hull) > 0.7
 
 
 def test_a_side_that_slopes_down_to_the_seabed_does_not_carve_its_body(monkeypatch):
@@ -178,37 +188,91 @@ def test_sides_beyond_the_volume_are_not_the_bodys_and_bound_no_plan():
     assert plan(0.6) is None
 
 
-@pytest.mark.parametrize(("share", "comes_back"), [(0.5, True), (1.0, False)])
-def test_a_plan_that_is_lit_from_everywhere_is_seabed_and_one_lit_from_half_of_it_a_body(share, comes_back):
-    """As between the blocks of a laying grid, whose shadows a slab of the grid's size would explain best."""
-    low = perfect_views(lambda x, y, s: hidden_by_box(x, y, s, LOW, (*HIGH[:2], 0.15)), INFOS, "mask")
-    carver = Carver(VOLUME, CarvingParameters())
-    for number, mask in enumerate(low):
+WIDE = (0.6, 0.5)
+WIDE_VOLUME = Volume.around((0.0, 0.0), (1.8, 1.6, 0.4), 0.04)
+
+
+def wide_views(high_m):
+    low, high = (-WIDE[0], -WIDE[1], 0.0), (*WIDE, high_m)
+    return list(perfect_views(lambda x, y, s: hidden_by_box(x, y, s, low, high), INFOS, "mask"))
+
+
+def lit_on_plan(high_m, lit_from=lambda number: True, *, walls=False):
+    """Return a carver of a low wide box whose plan is lit in some views, as its top or as seabed in walls."""
+    carver = Carver(WIDE_VOLUME, CarvingParameters())
+    for number, mask in enumerate(wide_views(high_m)):
         pixels = mask.pixels.copy()
-        if number % 10 < share * 10:
+        if lit_from(number):
             u, v = np.meshgrid(np.arange(pixels.shape[1]), np.arange(pixels.shape[0]))
-            ground = np.stack([u, v, np.ones_like(u)], axis=-1) @ mask.info.camera.pixel_to_ground.T
-            pixels[(np.abs(ground[..., 0]) < HIGH[0]) & (np.abs(ground[..., 1]) < HIGH[1])] = MASK_OUTSIDE
+            pixel = np.stack([u, v, np.ones_like(u)], axis=-1)
+            ground = (pixel @ mask.info.camera.pixel_to_ground.T)[..., :2]
+            shadow_m = high_m / math.tan(mask.info.camera.grazing_rad) * unit_to_sonar(mask.info.aspect_rad)
+            lit = np.all(np.abs(ground) < WIDE, axis=-1)
+            if walls:  # the near one throws its shadow on what it encloses
+                lit &= np.all(np.abs(ground + shadow_m) < WIDE, axis=-1)
+            pixels[lit] = MASK_OUTSIDE
         carver.integrate(View(mask.info, pixels))
+    return carver
+
+
+@pytest.mark.parametrize(
+    ("high_m", "lit_from", "walls", "comes_back"),
+    [
+        pytest.param(0.2, lambda number: number % 10 < 5, False, True, id="lit from half of the circle"),
+        pytest.param(0.2, lambda number: True, False, True, id="the lit top of a low wide body"),
+        pytest.param(0.1, lambda number: True, True, False, id="seabed within walls"),
+    ],
+)
+def test_what_is_lit_on_a_plan_is_a_bodys_top_unless_shadows_lie_on_it(high_m, lit_from, walls, comes_back):
+    """As between the blocks of a laying grid, whose shadows a slab of the grid's size would explain best."""
+    carver = lit_on_plan(high_m, lit_from, walls=walls)
     body = carver.grid()
+    assert body.occupied.any()
     whole = carver.given_back(body)
+    hull = carve(wide_views(high_m), WIDE_VOLUME)
     if comes_back:
-        assert whole.occupied.sum() > 5 * body.occupied.sum()
+        assert iou(whole.occupied, hull.occupied) > 0.8 > iou(body.occupied, hull.occupied) + 0.2
     else:
         assert whole is body
+
+
+@pytest.mark.parametrize("walls", [False, True])
+def test_a_low_body_that_its_own_top_carved_away_comes_back_on_its_plan(walls):
+    carver = lit_on_plan(0.1, walls=walls)
+    lost = carver.grid()
+    if not walls:
+        assert not lost.occupied.any()
+    nothing = replace(lost, occupied=np.zeros_like(lost.occupied))
+    found = Target((0.02, -0.03), (1.6, 1.3, 0.3))
+    back = carver.on_plan_of(found, nothing)
+    hull = carve(wide_views(0.1), WIDE_VOLUME)
+    if walls:
+        assert back is None
+        return
+    assert iou(back.occupied, hull.occupied) > 0.8
+    # What tells it better is not replaced.
+    assert carver.on_plan_of(found, hull) is None
+
+
+def test_without_shadow_nothing_comes_back():
+    carver = Carver(VOLUME, CarvingParameters())
+    for info in INFOS:
+        carver.integrate(View(info, np.zeros(info.camera.shape, np.uint8)))
+    assert carver.on_plan_of(Target((0.0, 0.0), (0.9, 0.6, 0.2)), carver.grid()) is None
 
 
 def test_columns_stand_on_a_plan():
     corners = np.array([[-0.2, -0.1], [0.3, -0.1], [0.3, 0.25], [-0.2, 0.25]])
     x, y = VOLUME.x_m, VOLUME.y_m
     inside = ((y > -0.1) & (y < 0.25))[:, None] & ((x > -0.2) & (x < 0.3))
-    assert np.array_equal(on_plan(corners, VOLUME), inside)
+    assert np.array_equal(StandingPlan(corners, 0.4).columns(VOLUME), inside)
 
 
 @pytest.mark.parametrize("info", INFOS[::11])
 def test_what_stands_on_a_plan_is_imaged_on_its_echo(info):
     corners = np.array([[-0.2, -0.1], [0.3, -0.1], [0.3, 0.25], [-0.2, 0.25]])
-    zone = echo_of_plan(info, corners, 0.4)
+    plan = StandingPlan(corners, 0.4)
+    zone = plan.echo(info)
     camera = info.camera
 
     def at(x, y, z):
@@ -221,7 +285,14 @@ def test_what_stands_on_a_plan_is_imaged_on_its_echo(info):
     assert not at(*(corners.mean(axis=0) + behind), 0.0)
     assert not at(*(corners.mean(axis=0) - behind), 0.4)
     # Three cells down-range and two across beyond the plan itself.
-    alone = echo_of_plan(info, corners, 0.0)
+    alone = StandingPlan(corners, 0.0).echo(info)
     cells = alone.sum() * np.prod(camera.spacing_m)
     down, across = np.array(info.resolution_m) * (6.0, 4.0)
     assert 0.5 * 0.35 < cells < (0.61 + down) * (0.61 + across)
+    # Its top lies within, clear of all edges, whatever its height is.
+    top = plan.top(info)
+    assert top.any()
+    assert not (top & ~alone).any()
+    assert not (top & ~zone).any()
+    clear = 1.5 * np.array(info.resolution_m)
+    assert top.sum() * np.prod(camera.spacing_m) <= 0.5 * 0.35 - 2.0 * clear.min() * 0.35

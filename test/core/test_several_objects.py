@@ -18,9 +18,9 @@ from csas_shadow_ros.core.parameters import (
 )
 from csas_shadow_ros.core.search.bodies import Search, stands_on_seabed
 from csas_shadow_ros.core.search.decision import decide
-from csas_shadow_ros.core.search.pieces import connected_pieces, overlap_share
+from csas_shadow_ros.core.search.pieces import connected_pieces, objects_of, overlap_share
 from csas_shadow_ros.core.shape.volume import Target, Volume, VoxelGrid
-from csas_shadow_ros.simulation import iou, shadow_hull, simulate
+from csas_shadow_ros.simulation import Faults, Profile, iou, shadow_hull, simulate
 from csas_shadow_ros.simulation.targets import box, cylinder, join_bodies
 
 #: A scene and what was found in it are dear: one worker makes each.
@@ -32,6 +32,21 @@ COARSE = PipelineParameters(
     carving=CarvingParameters(voxel_size_m=0.025),
 )
 BOX_M, CYLINDER_M = (0.8, 0.4, 0.4), (0.8, 0.3, 0.3)
+
+
+#: Cells of 6 cm across and more: a low body is two or three of them high.
+COARSE_SONAR = Profile(
+    name="coarse",
+    rows=512,
+    cols=512,
+    spacing_m=0.016,
+    radius_m=34.0,
+    height_m=21.4,
+    centre_frequency_hz=21.3e3,
+    bandwidth_hz=7.5e3,
+    block_deg=1.0,
+    edge_m=0.064,
+)
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +155,38 @@ def test_a_target_that_is_given_is_the_only_object(two):
     result = pipeline.run(run.image, run.track, p)
     assert len(result.objects) == 1
     assert result.objects[0].dimensions.position_m == pytest.approx(middles[1], abs=0.1)
+
+
+@pytest.mark.parametrize("height_m", [0.3, 0.4])
+def test_a_low_wide_body_beside_another_is_an_object_too(height_m):
+    """Its own lit top carves all of it away, or leaves a few voxels."""
+    bodies = box(1.2, 0.9, 1.0), box(1.9, 1.8, height_m)
+    for body, place in zip(bodies, ((-1.8, 1.2), (1.6, -1.2)), strict=True):
+        body.apply_translation([*place, 0.0])
+    faults = Faults(contrast_db=12.0)
+    run = simulate(COARSE_SONAR, join_bodies(bodies), seed=1, faults=faults, echo_db=6.0, workers=1)
+    carving = CarvingParameters(voxel_size_m=0.13)
+    p = PipelineParameters(sub_aperture=SubApertureParameters(step_deg=6.0), carving=carving)
+    objects = pipeline.run(run.image, run.track, p, workers=1).objects
+    assert len(objects) == 2
+    found = objects[1].dimensions
+    assert (found.length_m, found.width_m) == pytest.approx((1.9, 1.8), abs=0.3)
+    low, high = found.intervals["height_m"]
+    assert low <= height_m <= high
+
+
+def test_a_body_of_which_carving_leaves_crumbs_is_a_candidate():
+    crumbs = block_grid((0, 4, 4), (2, 6, 6))
+    found, left_out = objects_of(crumbs, (0.5, 0.6), [])
+    assert found == []
+    assert [one.strong for one in left_out] == [True]
+    assert left_out[0].position_m == (0.5, 0.6)
+    # Beside an object they are only crumbs.
+    both = np.array(crumbs.occupied)
+    both[0:5, 8:12, 8:12] = True
+    found, left_out = objects_of(replace(crumbs, occupied=both), (0.5, 0.6), [])
+    assert len(found) + len(left_out) == 2
+    assert not left_out[0].strong
 
 
 @of_laying_grid

@@ -23,6 +23,7 @@ from .decision import PHANTOM
 
 #: Why a body is none of which the views leave nothing.
 NOTHING_LEFT = "no voxel of its volume lies in shadow from all sides"
+_TOO_FEW = f"fewer than {LEAST_VOXELS} voxels are left of it"
 #: Two carved objects are the same body where they share this much of the smaller one.
 _SAME_BODY = 0.25
 #: Voxels round one of several pieces that were carved in one volume.
@@ -124,6 +125,11 @@ def overlap_share(a: VoxelGrid, b: VoxelGrid) -> float:
     return float(shared * d_a / smaller)
 
 
+def is_same_body(a: VoxelGrid, b: VoxelGrid) -> bool:
+    """Say whether two carved objects are the same body."""
+    return overlap_share(a, b) >= _SAME_BODY
+
+
 def objects_of(
     grid: VoxelGrid, place_m: tuple[float, float], reported: Sequence[VoxelGrid], *, cut: bool = False
 ) -> tuple[list[VoxelGrid], list[LeftOut]]:
@@ -150,6 +156,8 @@ def objects_of(
     pieces = connected_pieces(grid.occupied)
     if not pieces:
         return [], [nothing_left(place_m)]
+    if int(np.count_nonzero(pieces[0])) < LEAST_VOXELS:
+        return [], [LeftOut(place_m, _TOO_FEW, strong=True)]
     objects: list[VoxelGrid] = []
     left_out = []
     for piece in pieces:
@@ -164,7 +172,7 @@ def objects_of(
 def _why_no_object(grid: VoxelGrid, piece: NDArray[np.bool_], reported: Sequence[VoxelGrid]) -> str:
     """Return why a piece is no object of its own; empty if it is one."""
     if int(np.count_nonzero(piece)) < LEAST_VOXELS:
-        return f"fewer than {LEAST_VOXELS} voxels are left of it"
+        return _TOO_FEW
     alone = VoxelGrid(grid.volume, grid.likelihood, grid.views, grid.threshold, piece, grid.method)
     for number, other in enumerate(reported, start=1):
         share = overlap_share(alone, other)

@@ -26,7 +26,7 @@ BoolArray = NDArray[np.bool_]
 #: cells): a silhouette's own edge is that rough. At half of it a measured vehicle (docs/examples.md) grows
 #: from 7.3 to 8.1 m of length (6.95 in truth); at double a slab under a table falls from 0.60 to 0.46 of its
 #: hull.
-_ROUGH_CELLS = 1.5
+ROUGH_CELLS = 1.5
 
 
 @kernel()
@@ -116,7 +116,7 @@ def cast_shadow(mask: View, volume: Volume, occupied: BoolArray) -> BoolArray:
 def _about(pixels: BoolArray, mask: View) -> BoolArray:
     """Extend pixels by what a silhouette's edge is rough."""
     rows, cols = (
-        math.ceil(_ROUGH_CELLS * cell / spacing)
+        math.ceil(ROUGH_CELLS * cell / spacing)
         for cell, spacing in zip(mask.info.resolution_m, mask.info.camera.spacing_m, strict=True)
     )
     box = np.ones((2 * rows + 1, 2 * cols + 1), np.uint8)

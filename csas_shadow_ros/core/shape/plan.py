@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from ..geometry import TWO_PI, View, ViewInfo, cross_range_axis
 from ..imaging.mask_codes import MASK_SHADOW
-from .explained import cast_shadow
+from .explained import ROUGH_CELLS, cast_shadow
 from .layover import layover_per_metre
-from .volume import Volume, VoxelGrid
+from .volume import MARGIN_SHARE, Volume, VoxelGrid
 
 BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
@@ -192,59 +192,90 @@ def _outline(faces: FloatArray, support: FloatArray, volume: Volume) -> FloatArr
     return np.asarray(corners + middle)
 
 
-def on_plan(plan: FloatArray, volume: Volume) -> BoolArray:
-    """Say which columns of a volume stand on a plan.
+@dataclass(frozen=True, eq=False)
+class StandingPlan:
+    """The convex ground that a body stands on, and how high it is.
 
     Parameters
     ----------
-    plan : ndarray of float, shape (n, 2)
+    corners_m : ndarray of float, shape (n, 2)
         Corners (x, y), m, counter-clockwise.
-    volume : Volume
-        The lattice.
-
-    Returns
-    -------
-    ndarray of bool, shape (ny, nx)
-    """
-    x, y = np.meshgrid(volume.x_m, volume.y_m)
-    inside = np.ones(x.shape, np.bool_)
-    for (ax, ay), (bx, by) in zip(plan, np.roll(plan, -1, axis=0), strict=True):
-        inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= -1e-12
-    return inside
-
-
-def echo_of_plan(info: ViewInfo, plan: FloatArray, height_m: float) -> BoolArray:
-    """Mark the pixels of a view that the echo of anything that stands on a plan may lie on.
-
-    Parameters
-    ----------
-    info : ViewInfo
-        The view.
-    plan : ndarray of float, shape (n, 2)
-        Corners (x, y), m.
     height_m : float
         So high what stands there is at most, m.
-
-    Returns
-    -------
-    ndarray of bool, shape (rows, cols)
-
-    Notes
-    -----
-    Layover: (x, y) + z tan ψ û(θ), 0 ≤ z ≤ height. Of a convex plan that is convex too.
     """
-    camera = info.camera
-    ground = np.concatenate([plan, plan + height_m * layover_per_metre(info)])
-    pixels = ground @ camera.ground_to_pixel[:2, :2].T + camera.ground_to_pixel[:2, 2]
+
+    corners_m: FloatArray
+    height_m: float
+
+    def volume_round(self, volume: Volume) -> Volume:
+        """Return a volume if it holds the plan, one as high round the plan, with margins, otherwise."""
+        low, high = self.corners_m.min(axis=0), self.corners_m.max(axis=0)
+        off = np.maximum(np.abs(low - volume.centre_m[:2]), np.abs(high - volume.centre_m[:2]))
+        if (off <= 0.5 * np.array(volume.size_m[:2])).all():
+            return volume
+        (x, y), (along_x, along_y) = (low + high) / 2.0, (1.0 + 2.0 * MARGIN_SHARE) * (high - low)
+        size = (float(along_x), float(along_y), volume.size_m[2])
+        return Volume.around((float(x), float(y)), size, volume.voxel_size_m)
+
+    def columns(self, volume: Volume) -> BoolArray:
+        """Say which columns of a volume stand on it, shape (ny, nx)."""
+        x, y = np.meshgrid(volume.x_m, volume.y_m)
+        inside = np.ones(x.shape, np.bool_)
+        corners = self.corners_m
+        for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= -1e-12
+        return inside
+
+    def echo(self, info: ViewInfo) -> BoolArray:
+        """Mark the pixels of a view that the echo of anything that stands on it may lie on.
+
+        Returns
+        -------
+        ndarray of bool, shape (rows, cols)
+
+        Notes
+        -----
+        Layover: (x, y) + z tan ψ û(θ), 0 ≤ z ≤ height. Of a convex plan that is convex too.
+        """
+        pixels = np.concatenate([self._pixels(info, 0.0), self._pixels(info, self.height_m)])
+        down, across = _cells_px(info, _RESPONSE_CELLS)
+        room = [(u * across, v * down) for u in (-1.0, 1.0) for v in (-1.0, 1.0)]
+        corners = cv2.convexHull(np.concatenate([pixels + one for one in room]).astype(np.float32))
+        return _filled(info, np.asarray(corners, dtype=np.float64))
+
+    def top(self, info: ViewInfo) -> BoolArray:
+        """Mark the pixels of a view that show the top of a body, clear of its edges, however high it is.
+
+        Returns
+        -------
+        ndarray of bool, shape (rows, cols)
+        """
+        foot, top = (_filled(info, self._pixels(info, z)) for z in (0.0, self.height_m))
+        down, across = (math.ceil(px) for px in _cells_px(info, (ROUGH_CELLS, ROUGH_CELLS)))
+        box = np.ones((2 * down + 1, 2 * across + 1), np.uint8)
+        return np.asarray(cv2.erode((foot & top).view(np.uint8), box).view(np.bool_))
+
+    def _pixels(self, info: ViewInfo, height_m: float) -> FloatArray:
+        """Return where its corners are imaged at some height, (column, row)."""
+        ground = self.corners_m + height_m * layover_per_metre(info)
+        affine = info.camera.ground_to_pixel
+        return np.asarray(ground @ affine[:2, :2].T + affine[:2, 2])
+
+
+def _cells_px(info: ViewInfo, cells: tuple[float, float]) -> tuple[float, float]:
+    """Return (down-range, across) in pixels for resolution cells."""
     down, across = (
-        cells * cell / spacing
-        for cells, cell, spacing in zip(_RESPONSE_CELLS, info.resolution_m, camera.spacing_m, strict=True)
+        n * cell / spacing
+        for n, cell, spacing in zip(cells, info.resolution_m, info.camera.spacing_m, strict=True)
     )
-    room = [(u * across, v * down) for u in (-1.0, 1.0) for v in (-1.0, 1.0)]
-    corners = cv2.convexHull(np.concatenate([pixels + one for one in room]).astype(np.float32))
-    out = np.zeros(camera.shape, np.uint8)
-    cv2.fillConvexPoly(out, np.rint(corners * 16.0).astype(np.int32), 1, shift=4)
+    return down, across
+
+
+def _filled(info: ViewInfo, corners_px: FloatArray) -> BoolArray:
+    """Mark the pixels within a convex polygon, (column, row) of its corners."""
+    out = np.zeros(info.camera.shape, np.uint8)
+    cv2.fillConvexPoly(out, np.rint(corners_px * 16.0).astype(np.int32), 1, shift=4)
     return out.view(np.bool_)
 
 
-__all__ = ["ShadowSides", "echo_of_plan", "on_plan", "plan_of_sides", "shadow_sides"]
+__all__ = ["ShadowSides", "StandingPlan", "plan_of_sides", "shadow_sides"]
