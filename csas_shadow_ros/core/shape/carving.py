@@ -74,7 +74,8 @@ _FACING = 0.4
 #: of the grid's size, 0.48 to 0.60. At half nothing known changes; at double the walls are a slab.
 _DARK_TOP = 0.1
 #: Such a body's plan may be so many times as long and as wide as the volume that the search found: it found
-#: 1.4 m of bricks of 2.0 and 1.6 m, which stay lost at half (IoU with the hull 0.05 for 0.8).
+#: 1.4 m of bricks of 2.0 and 1.6 m. These stay lost at half (IoU with the hull 0.05 for 0.8); double was not
+#: measured.
 _WIDER = 2.0
 #: A body that leaves more than this of its segmented shadow unexplained is lost: the mean likelihood may tell
 #: it instead. Where that tells nothing, what stands on the plan of its shadows may leave less than this

@@ -116,9 +116,9 @@ _CAP_SLACK = (0.2, 0.3)
 #: 0.46 m for 0.42 m). A pole's layers are all as thin.
 _CAP_TIP, _CAP_TIP_SHARE = 2.0, 1.0 / 3.0
 #: A hole in a layer of up to this radius (cross-range cells) is speckle: in the middle of a low top it makes
-#: the layer as thin as what is round it, and the cap seems to begin at its own top. Of 108 extents
-#: of 36 low bodies (docs/method.md) 71 are within 5 % or a voxel and 3 outside of their intervals; at half 68
-#: and 10, at double the same 71 and 3. A hollow wider than that is none of speckle.
+#: the layer as thin as what is round it, and the cap seems to begin at its own top. A wider hole is a
+#: hollow. Of 108 extents of 36 low bodies (docs/method.md) 71 are within 5 % or a voxel and 3 outside of
+#: their intervals; at half 68 and 10, at double 71 and 3.
 _HOLE_CELLS = 1.0
 #: How gradually it begins tells a dome: between these two, voxels under the cap's top.
 _DOME_SLACK = (0.5, 2.0)
