@@ -21,10 +21,25 @@ from csas_shadow_ros.core.geometry import (
 )
 from csas_shadow_ros.core.imaging.subaperture import SubApertures
 from csas_shadow_ros.core.parameters import SubApertureParameters
+from csas_shadow_ros.simulation import Profile
 
 RADIUS_M, HEIGHT_M = 30.0, 12.0
 #: Band 374 … 560 rad/m on the ground; a pixel of 5 mm holds 628 rad/m.
 SPACING_M = 0.005
+
+#: Cells of 6 cm across and more: a low body is two or three of them high.
+COARSE_SONAR = Profile(
+    name="coarse",
+    rows=512,
+    cols=512,
+    spacing_m=0.016,
+    radius_m=34.0,
+    height_m=21.4,
+    centre_frequency_hz=21.3e3,
+    bandwidth_hz=7.5e3,
+    block_deg=1.0,
+    edge_m=0.064,
+)
 
 
 def acoustics(sign=1):

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from core_data import hidden_by_box, iou, make_info, perfect_views
+from core_data import COARSE_SONAR, hidden_by_box, iou, make_info, perfect_views
 
 from csas_shadow_ros.core.geometry import View, unit_to_sonar
 from csas_shadow_ros.core.imaging.mask_codes import MASK_OUTSIDE, MASK_SHADOW
@@ -22,22 +22,10 @@ from csas_shadow_ros.core.shape.plan import (
     shadow_sides,
 )
 from csas_shadow_ros.core.shape.volume import Target, Volume
-from csas_shadow_ros.simulation import Faults, Profile, shadow_hull, simulate
+from csas_shadow_ros.simulation import Faults, shadow_hull, simulate
 from csas_shadow_ros.simulation.bodies import brick, convex
 from csas_shadow_ros.simulation.targets import join_bodies
 
-PROFILE = Profile(
-    name="coarse",
-    rows=512,
-    cols=512,
-    spacing_m=0.016,
-    radius_m=34.0,
-    height_m=21.4,
-    centre_frequency_hz=21.3e3,
-    bandwidth_hz=7.5e3,
-    block_deg=1.0,
-    edge_m=0.064,
-)
 VOXEL_M = 0.13
 
 
@@ -56,7 +44,7 @@ def table():
 def carved(mesh, monkeypatch):
     """Return the grid of a simulated body, the one that nothing was given back to, and its shadow hull."""
     simulated = simulate(
-        PROFILE, mesh, seed=3, heading_deg=25.0, faults=Faults(contrast_db=15.0), echo_db=6.0, workers=1
+        COARSE_SONAR, mesh, seed=3, heading_deg=25.0, faults=Faults(contrast_db=15.0), echo_db=6.0, workers=1
     )
     bare = []
     given_back = Carver.given_back

@@ -298,6 +298,24 @@ def test_views_that_cannot_be_searched_are_an_error_that_names_why():
         search_image(dark, made.track, Spectrum.of_image(dark))
 
 
+def evidence_of_the_other_sign(monkeypatch, length_cells, front, *, is_faint=False):
+    """Return what is told of the sign where the other one alone shows a body, and what was searched."""
+    made = simulate("tiny", "empty", seed=2)
+    searches = []
+
+    def search(looks, camera, extent_m, *, twice=True):
+        searches.append(looks)
+        nothing = Search((), None, None, is_faint=is_faint)
+        if len(searches) == 1:
+            return nothing
+        thrown = Thrown(length_cells * cell_m(looks), 0.2, 0.16, front)
+        return replace(nothing, targets=(Target(PLACE, (0.4, 0.4, 0.2), 1e-4),), thrown=(thrown,))
+
+    monkeypatch.setattr(bodies, "_search", search)
+    evidence, stated = spectrum_sign_evidence(made.image, made.track)
+    return evidence, stated, searches
+
+
 @pytest.mark.parametrize(
     ("length_cells", "front", "verdict"),
     [(3.0, 1.0, "wrong"), (3.0, np.nan, "wrong"), (1.2, 1.0, "unknown"), (3.0, 0.4, "unknown")],
@@ -306,19 +324,7 @@ def test_views_that_cannot_be_searched_are_an_error_that_names_why():
 def test_only_a_shadow_that_is_one_sided_and_long_tells_a_wrong_sign(
     monkeypatch, length_cells, front, verdict
 ):
-    made = simulate("tiny", "empty", seed=2)
-    searches = []
-
-    def search(looks, camera, extent_m, *, twice=True):
-        searches.append(looks)
-        nothing = Search((), None, None)
-        if len(searches) == 1:
-            return nothing
-        thrown = Thrown(length_cells * cell_m(looks), 0.2, 0.16, front)
-        return replace(nothing, targets=(Target(PLACE, (0.4, 0.4, 0.2), 1e-4),), thrown=(thrown,))
-
-    monkeypatch.setattr(bodies, "_search", search)
-    evidence, stated = spectrum_sign_evidence(made.image, made.track)
+    evidence, stated, searches = evidence_of_the_other_sign(monkeypatch, length_cells, front)
     assert len(searches) == 2
     assert evidence.verdict == verdict
     # What does not tell it is a candidate.
@@ -348,18 +354,6 @@ def test_what_is_as_dark_before_it_as_behind_it_is_sediment_or_stands_on_it(fron
 def test_what_is_faint_raises_a_doubt_of_the_sign_even_where_it_would_prove_nothing(
     monkeypatch, length_cells, front
 ):
-    made = simulate("tiny", "empty", seed=2)
-    searches = []
-
-    def search(looks, camera, extent_m, *, twice=True):
-        searches.append(looks)
-        nothing = Search((), None, None, is_faint=True)
-        if len(searches) == 1:
-            return nothing
-        thrown = Thrown(length_cells * cell_m(looks), 0.2, 0.16, front)
-        return replace(nothing, targets=(Target(PLACE, (0.4, 0.4, 0.2), 1e-4),), thrown=(thrown,))
-
-    monkeypatch.setattr(bodies, "_search", search)
-    evidence, stated = spectrum_sign_evidence(made.image, made.track)
+    evidence, stated, _ = evidence_of_the_other_sign(monkeypatch, length_cells, front, is_faint=True)
     assert evidence.verdict == "unknown"
     assert ["a faint body throws a shadow here" in left.reason for left in stated.left_out] == [True]

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from core_data import COARSE_SONAR
 
 from csas_shadow_ros.core import pipeline
 from csas_shadow_ros.core.errors import ParameterError
@@ -20,7 +21,7 @@ from csas_shadow_ros.core.search.bodies import Search, stands_on_seabed
 from csas_shadow_ros.core.search.decision import decide
 from csas_shadow_ros.core.search.pieces import connected_pieces, objects_of, overlap_share
 from csas_shadow_ros.core.shape.volume import Target, Volume, VoxelGrid
-from csas_shadow_ros.simulation import Faults, Profile, iou, shadow_hull, simulate
+from csas_shadow_ros.simulation import Faults, iou, shadow_hull, simulate
 from csas_shadow_ros.simulation.targets import box, cylinder, join_bodies
 
 #: A scene and what was found in it are dear: one worker makes each.
@@ -32,21 +33,6 @@ COARSE = PipelineParameters(
     carving=CarvingParameters(voxel_size_m=0.025),
 )
 BOX_M, CYLINDER_M = (0.8, 0.4, 0.4), (0.8, 0.3, 0.3)
-
-
-#: Cells of 6 cm across and more: a low body is two or three of them high.
-COARSE_SONAR = Profile(
-    name="coarse",
-    rows=512,
-    cols=512,
-    spacing_m=0.016,
-    radius_m=34.0,
-    height_m=21.4,
-    centre_frequency_hz=21.3e3,
-    bandwidth_hz=7.5e3,
-    block_deg=1.0,
-    edge_m=0.064,
-)
 
 
 @pytest.fixture(scope="module")

@@ -772,7 +772,7 @@ class Carver:
         plan = beside._own_plan(body, self.volume)
         if plan is None:
             return body
-        left = beside._again(lambda kept: _unknown_where(kept, plan.echo(kept.info))).first_look()
+        left = beside._clear_of_plan(plan).first_look()
         whole = self._with(body, left, left.occupied & plan.columns(self.volume) & ~body.occupied)
         faces = self._mostly_under(_FACING, body, whole.occupied & ~body.occupied)
         fit = self.misfit([whole, *others]) if unexplained >= _EXPLAINED else (math.nan, math.nan)
@@ -851,7 +851,7 @@ class Carver:
         if plan is None or not self._dark_on(plan) < _DARK_TOP:
             return None
         carver = self._in(plan.volume_round(self.volume))
-        cleared = carver._clear_of(others)._again(lambda kept: _unknown_where(kept, plan.echo(kept.info)))
+        cleared = carver._clear_of(others)._clear_of_plan(plan)
         left = cleared.first_look()
         body = replace(left, occupied=left.occupied & plan.columns(left.volume))
         if not body.occupied.any():
@@ -869,9 +869,9 @@ class Carver:
         return carver
 
     def _dark_on(self, plan: StandingPlan) -> float:
-        """Return the share of the segmented shadow that lies on the top of a plan: mean over the views.
+        """Return the share of the segmented shadow on the top of a plan, mean over the views.
 
-        It would be lit if it were a body's, from edge to edge.
+        The top of a body is lit from edge to edge.
         """
         shares = []
         for kept in self._masks.values():
@@ -890,6 +890,10 @@ class Carver:
             return None
         top = int(np.flatnonzero(body.occupied.any(axis=(1, 2)))[-1])
         return StandingPlan(corners, float(body.volume.z_m[top]) + body.volume.voxel_size_m / 2.0)
+
+    def _clear_of_plan(self, plan: StandingPlan) -> Carver:
+        """Carve the same masks again, lit pixels that may be the echo of what stands on a plan as unknown."""
+        return self._again(lambda kept: _unknown_where(kept, plan.echo(kept.info)))
 
     def _with(self, body: VoxelGrid, other: VoxelGrid, voxels: NDArray[np.bool_]) -> VoxelGrid:
         """Add some voxels of another body to one."""

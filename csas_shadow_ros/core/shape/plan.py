@@ -208,7 +208,7 @@ class StandingPlan:
     height_m: float
 
     def volume_round(self, volume: Volume) -> Volume:
-        """Return a volume if it holds the plan, one as high round the plan, with margins, otherwise."""
+        """Return the volume if it holds the plan; otherwise one as high, round the plan with margins."""
         low, high = self.corners_m.min(axis=0), self.corners_m.max(axis=0)
         off = np.maximum(np.abs(low - volume.centre_m[:2]), np.abs(high - volume.centre_m[:2]))
         if (off <= 0.5 * np.array(volume.size_m[:2])).all():
@@ -244,7 +244,7 @@ class StandingPlan:
         return _filled(info, np.asarray(corners, dtype=np.float64))
 
     def top(self, info: ViewInfo) -> BoolArray:
-        """Mark the pixels of a view that show the top of a body, clear of its edges, however high it is.
+        """Mark the pixels of a view that show the top, clear of its edges, of a body up to the plan's height.
 
         Returns
         -------
