@@ -21,6 +21,7 @@ from ..core.parameters import MAX_OBJECTS, PipelineParameters, Stage
 from ..node_table import NODES as _NODES
 from ..node_table import REPLACEABLE, chain, joins, makers
 from ..nodes.runtime.params import NODES, check
+from ..nodes.runtime.rivals import at_work
 from .processes import (
     MAX_DOMAIN_ID,
     DomainReservation,
@@ -348,10 +349,8 @@ class _Watcher:
                     while (taken := handle.take_message(subscription.msg_type, subscription.raw)) is not None:
                         subscription.callback(taken[0])
         if self.rival:
-            raise ReplayError(
-                f"{self.rival} is at work in ROS domain {self._context.get_domain_id()}, namespace"
-                f" {self._node.get_namespace()}, and no view says whose it is; expected a domain of its own"
-            )
+            there = at_work(self.rival, self._node.get_namespace(), self._context.get_domain_id())
+            raise ReplayError(f"{there}, and no view says whose it is; expected a domain of its own")
         time.sleep(seconds)
 
     def collect(self, topics: Iterable[str]) -> None:
@@ -669,8 +668,11 @@ def _until_complete(
             watcher.died(line.partition(" ")[0])
             tell(f"{line}; it is started again")
         told = len(graph.deaths)
-        for name, text in watcher.errors.items():
-            raise _error_of(name, text)
+        if watcher.errors:
+            # What stops a node may be another graph, which it can have heard before this process has.
+            watcher.spin(2 * BEAT_S)
+            watcher.spin(0.0)
+            raise _error_of(*next(iter(watcher.errors.items())))
         if not finished:  # then it has nothing left to do, and may have ended
             watcher.look_for_stages(tell)
         beat = watcher.beats.get((sender, source))

@@ -6,6 +6,7 @@ import os
 import random
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from csas_shadow_ros.bags import BagReader, BagWriter, write_run
 from csas_shadow_ros.core.errors import BagError
 from csas_shadow_ros.core.pipeline import ProcessedView, Result, run
 from csas_shadow_ros.graph.processes import DomainReservation, ReplayError
-from csas_shadow_ros.graph.replay import replay
+from csas_shadow_ros.graph.replay import _Watcher, replay
 from csas_shadow_ros.nodes.bag_player import BagPlayerNode
 from csas_shadow_ros.nodes.bag_recorder import BagRecorderNode
 from csas_shadow_ros.nodes.runtime.rivals import Rivals
@@ -118,15 +119,34 @@ def test_two_replays_into_one_domain_are_one_too_many(domain: int, run_bag: Path
         replay(run_bag, parameters=PARAMETERS, domain_id=domain, progress=False)
 
 
+@pytest.mark.parametrize("a_node_hears_first", [False, True])
 @pytest.mark.parametrize(
     ("identity", "named"),
     [("somebody", r"composites of another graph \(somebody\)"), ("", "composites that this replay did not")],
 )
 def test_a_replay_in_the_domain_of_a_live_graph_ends_by_name(
-    graph: Graph, run_bag: Path, monkeypatch: pytest.MonkeyPatch, identity: str, named: str
+    graph: Graph,
+    run_bag: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    identity: str,
+    named: str,
+    a_node_hears_first: bool,
 ) -> None:
     from csas_shadow_ros.nodes.composites import CompositesNode
 
+    on_progress = _Watcher._on_progress
+
+    complained_s: list[float] = []
+
+    def deaf_until_a_node_has_complained(self: _Watcher, cdr: bytes) -> None:
+        on_progress(self, cdr)
+        if self.errors:
+            complained_s.append(time.monotonic())
+        if not complained_s or time.monotonic() < complained_s[0] + 0.3:  # its next round of messages
+            self.rival = ""
+
+    if a_node_hears_first:
+        monkeypatch.setattr(_Watcher, "_on_progress", deaf_until_a_node_has_complained)
     monkeypatch.setenv(GRAPH_ID, identity)
     graph.add(CompositesNode)
     graph._domain.close()
@@ -166,7 +186,8 @@ def test_a_live_graph_takes_and_sends_nothing_while_another_is_there_and_goes_on
     ours = [nodes["carver"], nodes["sub_aperture"], *([recorder] if identity else [])]
     graph.spin_until(lambda: all(node.rival for node in (*ours, *theirs)), 120.0)
     who = "of another graph (theirs)" if identity else "another "
-    assert all(who in node.trouble and "is at work in /csas" in node.trouble for node in ours)
+    where = f"is at work in ROS domain {graph.domain_id}, namespace /csas"
+    assert all(who in node.trouble and where in node.trouble for node in ours)
     assert theirs[0].state_counts()["views"] < 36
     for node in theirs:
         graph.nodes.remove(node)

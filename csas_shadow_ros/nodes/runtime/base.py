@@ -71,7 +71,7 @@ from .flow import Flow
 from .hearing import Deaf, Reach, make_hearing
 from .host import Host
 from .params import DYNAMIC, NODES, declare, from_overrides
-from .rivals import Rivals
+from .rivals import Rivals, at_work
 from .secured import security_told
 from .shared_memory import tidy_up_after_a_killed_graph
 from .watchdog import ends_if_it_stands_still
@@ -335,8 +335,7 @@ class CsasNode(LifecycleNode):
     def _look_for_rivals(self) -> None:
         who = self.rivals.look()
         if who and not self.rival:
-            domain = self.context.get_domain_id()
-            self.rival = f"{who} is at work in {self.get_namespace()}, ROS domain {domain}"
+            self.rival = at_work(who, self.get_namespace(), self.context.get_domain_id())
             self.get_logger().error(f"{self.rival}: receiving and sending nothing until it ends")
         elif not who and self.rival:
             self.get_logger().warning(f"{self.rival.partition(' is at work')[0]} has gone: resuming")

@@ -19,6 +19,11 @@ _LIVES_S = 0.25
 _DEAF_S = 1.0
 
 
+def at_work(who: str, namespace: str, domain_id: int) -> str:
+    """Name another graph and where it is, in the words of every node and of `replay`."""
+    return f"{who} is at work in ROS domain {domain_id}, namespace {namespace}"
+
+
 class Rivals:
     """Detects other graphs in a node's namespace.
 
