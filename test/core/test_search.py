@@ -27,6 +27,7 @@ from csas_shadow_ros.core.search.bodies import (
 from csas_shadow_ros.core.search.decision import decide
 from csas_shadow_ros.core.search.detectable import detectable_of
 from csas_shadow_ros.core.search.pieces import objects_of
+from csas_shadow_ros.core.search.relief import Shading, shading
 from csas_shadow_ros.core.shape.result import Detectable, LeftOut, Quality, Result
 from csas_shadow_ros.core.shape.verdict import judge, no_object_reason
 from csas_shadow_ros.core.shape.volume import Target
@@ -37,6 +38,8 @@ from csas_shadow_ros.simulation.targets import box
 
 COARSE = PipelineParameters(sub_aperture=SubApertureParameters(step_deg=6.0))
 PLACE = (0.1, -0.1)
+#: How the amplitude round a body goes with the aspect: not as a slope's.
+OF_A_BODY = Shading(0.5, 0.9)
 
 
 def seabed_alone(bed):
@@ -50,6 +53,70 @@ def test_a_hollow_is_no_wrong_sign_but_a_doubt(radius_m, depth_m):
     assert result.verdict == "undecided"
     assert result.quality.verdict == "not trustworthy"
     assert any("a hollow in the seabed" in reason for reason in result.quality.reasons)
+
+
+@pytest.mark.parametrize(("radius_m", "depth_m"), [(0.6, 0.15), (0.6, 0.2)])
+@pytest.mark.parametrize("level_db", [-8.0, -5.0, -3.0])
+def test_a_hollow_that_dark_sediment_fills_is_no_wrong_sign_and_no_object(radius_m, depth_m, level_db):
+    """Its lit wall is no brighter than the seabed round about."""
+    mud = Patch(PLACE, (1.2 * radius_m, 1.2 * radius_m), 0.0, level_db, 0.3)
+    hollow = seabed_alone(Seabed(bumps=(Bump(PLACE, radius_m, -depth_m),), patches=(mud,)))
+    result = run(hollow.image, hollow.track, COARSE)
+    assert result.objects == []
+    assert result.verdict == "undecided"
+    assert any("a hollow in" in reason for reason in result.quality.reasons)
+
+
+@pytest.mark.parametrize("radius_m", [0.3, 0.5, 0.7])
+@pytest.mark.parametrize("steep", [0.5, 0.67, 0.75])
+def test_a_rise_too_flat_for_a_shadow_is_a_candidate_and_no_object(radius_m, steep):
+    """The sonar sees the seabed at 22°; the side of the rise away from it is up to 12 dB darker."""
+    height_m = steep * 0.4 * radius_m * 2.0 / np.pi
+    rise = seabed_alone(Seabed(bumps=(Bump(PLACE, radius_m, height_m),)))
+    result = run(rise.image, rise.track, COARSE)
+    assert (result.verdict, result.objects) == ("undecided", [])
+    (left,) = result.left_out
+    assert "as bright on the side of the sonar: the seabed rises, or a low body" in left.reason
+    assert np.hypot(*np.subtract(left.position_m, PLACE)) < 0.1 * radius_m + 0.02
+
+
+def test_the_faces_of_slopes_and_the_shadows_of_bodies_go_round_the_circle_in_other_ways():
+    """Amplitude by Lambert's rule, speckle of four looks."""
+    rng = np.random.default_rng(1)
+    aspects = np.radians(np.arange(0.0, 360.0, 10.0))
+    at = np.stack([g.ravel() for g in np.meshgrid(*(np.linspace(-1.0, 1.0, 21),) * 2)])
+    radius, side = np.hypot(*at), np.arctan2(at[1], at[0])
+
+    def seen(amplitude_of):
+        looks = []
+        for aspect in aspects:
+            off = np.angle(np.exp(1j * (side - aspect)))
+            power = amplitude_of(off) ** 2 * rng.gamma(4.0, 0.25, len(radius))
+            looks.append((aspect, power, np.ones(len(radius), bool)))
+        rng.shuffle(looks)
+        return shading(at, looks)
+
+    slope = np.where(radius < 1.0, 0.7 * np.sin(np.pi * radius), 0.0)
+    mud = np.where(radius < 0.8, 0.5, 1.0)
+    rise, hollow = (
+        seen(lambda off: 1.0 + slope * np.cos(off)),
+        seen(lambda off: mud - mud * slope * np.cos(off)),
+    )
+    assert rise.is_rise
+    assert not rise.is_hollow
+    assert hollow.may_be_relief
+    assert hollow.is_hollow
+    assert not hollow.is_rise
+    # The shadow of a drum of half the disc's radius, and of one as a rod is narrow; each with an echo.
+    for half in (np.arcsin(np.minimum(0.5 / np.maximum(radius, 0.5), 1.0)), np.full(len(radius), 0.2)):
+        body = seen(
+            lambda off, half=half: np.where(abs(off) > np.pi - half, 0.2, np.where(abs(off) < 0.1, 1.4, 1.0))
+        )
+        assert not body.may_be_relief
+        assert body.outward > 0.3
+    sediment = seen(lambda off: mud)
+    assert not sediment.is_rise
+    assert not sediment.is_hollow
 
 
 @pytest.mark.parametrize("target", ["box", "cone", "l_shape"])
@@ -298,17 +365,18 @@ def test_views_that_cannot_be_searched_are_an_error_that_names_why():
         search_image(dark, made.track, Spectrum.of_image(dark))
 
 
-def evidence_of_the_other_sign(monkeypatch, length_cells, front, *, is_faint=False):
+def evidence_of_the_other_sign(monkeypatch, length_cells, front, *, is_faint=False, left=0.5):
     """Return what is told of the sign where the other one alone shows a body, and what was searched."""
     made = simulate("tiny", "empty", seed=2)
     searches = []
 
-    def search(looks, camera, extent_m, *, twice=True):
+    def search(looks, camera, extent_m, *, twice=True, rises=False):
         searches.append(looks)
         nothing = Search((), None, None, is_faint=is_faint)
         if len(searches) == 1:
             return nothing
-        thrown = Thrown(length_cells * cell_m(looks), 0.2, 0.16, front)
+        assert rises, "the other way round they are hollows"
+        thrown = Thrown(length_cells * cell_m(looks), 0.2, 0.16, front, Shading(left, 0.9))
         return replace(nothing, targets=(Target(PLACE, (0.4, 0.4, 0.2), 1e-4),), thrown=(thrown,))
 
     monkeypatch.setattr(bodies, "_search", search)
@@ -317,14 +385,20 @@ def evidence_of_the_other_sign(monkeypatch, length_cells, front, *, is_faint=Fal
 
 
 @pytest.mark.parametrize(
-    ("length_cells", "front", "verdict"),
-    [(3.0, 1.0, "wrong"), (3.0, np.nan, "wrong"), (1.2, 1.0, "unknown"), (3.0, 0.4, "unknown")],
-    ids=["a body", "a body at the edge", "a patch in shifted views", "a patch with soft edges"],
+    ("length_cells", "front", "left", "verdict"),
+    [
+        (3.0, 1.0, 0.5, "wrong"),
+        (3.0, np.nan, 0.5, "wrong"),
+        (1.2, 1.0, 0.5, "unknown"),
+        (3.0, 0.4, 0.5, "unknown"),
+        (3.0, 1.0, 0.05, "unknown"),
+    ],
+    ids=["a body", "a body at the edge", "a patch in shifted views", "a patch with soft edges", "a slope"],
 )
 def test_only_a_shadow_that_is_one_sided_and_long_tells_a_wrong_sign(
-    monkeypatch, length_cells, front, verdict
+    monkeypatch, length_cells, front, left, verdict
 ):
-    evidence, stated, searches = evidence_of_the_other_sign(monkeypatch, length_cells, front)
+    evidence, stated, searches = evidence_of_the_other_sign(monkeypatch, length_cells, front, left=left)
     assert len(searches) == 2
     assert evidence.verdict == verdict
     # What does not tell it is a candidate.
@@ -335,7 +409,7 @@ def test_only_a_shadow_that_is_one_sided_and_long_tells_a_wrong_sign(
 def test_what_is_as_dark_before_it_as_behind_it_is_sediment_or_stands_on_it(front, found):
     made = simulate("tiny", "empty", seed=2)
     looks = search_image(made.image, made.track, Spectrum.of_image(made.image)).looks
-    thrown = Thrown(3.0 * cell_m(looks), 0.25, 0.2, front)
+    thrown = Thrown(3.0 * cell_m(looks), 0.25, 0.2, front, OF_A_BODY)
     body = SimpleNamespace(
         target=lambda: Target(PLACE, (0.4, 0.4, 0.2), 1e-3),
         thrown=lambda looks: thrown,

@@ -34,6 +34,7 @@ from ..parameters import (
 from ..shape.carving import Carver
 from ..shape.result import OTHER_SIGN, LeftOut
 from ..shape.volume import MARGIN_SHARE, Target, Volume
+from .relief import Shading, shading
 
 #: Aperture (deg) of the views that search: narrow enough that shadows stay sharp without enhancement.
 _SEARCH_APERTURE_DEG = 6.0
@@ -147,12 +148,15 @@ class Thrown:
     front : float
         Mean power as far before the body as its shadow reaches behind it, over the seabed's, echoes as 2.1;
         median of the views, NaN where that is off the scene.
+    shading : Shading
+        How the amplitude of the body and round about, as far as its shadow reaches, goes with the aspect.
     """
 
     length_m: float
     power: float
     core: float
     front: float
+    shading: Shading
 
     @property
     def contrast_db(self) -> float:
@@ -275,10 +279,12 @@ def _power(view: View, levels: Levels, parameters: LikelihoodParameters, radius_
     return replace(view, pixels=pixels)
 
 
-def _search(looks: Sequence[Look], camera: ShadowCamera, extent_m: float, *, twice: bool = True) -> Search:
+def _search(
+    looks: Sequence[Look], camera: ShadowCamera, extent_m: float, *, twice: bool = True, rises: bool = False
+) -> Search:
     """Carve the whole scene coarsely and list its bodies; `camera` is any of the views'.
 
-    `twice`: look again, for the faint.
+    `twice`: look again, for the faint; `rises`: those of the seabed are bodies.
     """
     middle = camera.pixel_to_ground[:2] @ np.array([(camera.cols - 1) / 2.0, (camera.rows - 1) / 2.0, 1.0])
     voxel = extent_m / _SEARCH_VOXELS
@@ -288,7 +294,7 @@ def _search(looks: Sequence[Look], camera: ShadowCamera, extent_m: float, *, twi
     mean = _carved(volume, (look.likelihood for look in looks))
     with np.errstate(invalid="ignore"):
         bodies = _bodies(mean < _DARK, mean, volume)
-    judged = Judged()
+    judged = Judged(rises=rises)
     for body in bodies:
         if body.core <= _CORE:
             judged.add(body, looks)
@@ -406,7 +412,20 @@ class _Body:
         length = float(np.median(lengths))
         share = (off - core) / max(1.0 - core, 1e-3)
         front = float(np.median(fronts))
-        return Thrown(length, share, core, front)
+        return Thrown(length, share, core, front, self._shading(looks, length))
+
+    def _shading(self, looks: Sequence[Look], length_m: float) -> Shading:
+        """Look at a disc round its plan, as far off it as its shadow reaches."""
+        (x, y), d = self.target().position_m, self.volume.voxel_size_m
+        reach = (max(map(np.ptp, self.voxels[1:])) + 1) * d / 2.0 + length_m
+        at = np.arange(-reach, reach + d, d)
+        off_x, off_y = (values.ravel() for values in np.meshgrid(at, at))
+        disc = np.hypot(off_x, off_y) <= reach
+        off = np.stack([off_x[disc], off_y[disc]])
+        at_x, at_y = x + off[0], y + off[1]
+        return shading(
+            off, ((look.power.info.aspect_rad, *_powers_at(look.power, at_x, at_y)) for look in looks)
+        )
 
 
 def cell_m(looks: Sequence[Look]) -> float:
@@ -475,6 +494,8 @@ class Judged:
     left_out: list[LeftOut] = field(default_factory=list)
     #: What is faint and does not reach down to the seabed, likewise.
     hanging: list[tuple[Target, Thrown, bool]] = field(default_factory=list)
+    #: A rise counts as a body: under the other sign it may be a hollow, which raises a doubt.
+    rises: bool = False
     #: Where the bodies are, on the seabed: (y, x) numbers in the search's volume.
     plans: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = field(default_factory=list)
 
@@ -509,7 +530,14 @@ class Judged:
             self.left_out.append(LeftOut((x, y), f"{told}: sediment, or a body on it", strong=True))
             return
         self.plans.append(body.voxels[1:])
-        if not target.stands and not faint:
+        told = f"dark by {thrown.contrast_db:.0f} dB, "
+        if thrown.shading.is_rise and not self.rises:
+            told += "and as bright on the side of the sonar: the seabed rises, or a low body"
+            self.left_out.append(LeftOut((x, y), told, strong=True))
+        elif thrown.power <= _CAST and thrown.shading.is_hollow:
+            told += "and bright on the far side: a hollow in dark seabed"
+            self.left_out.append(LeftOut((x, y), told, strong=True))
+        elif not target.stands and not faint:
             self.found.append((target, thrown, faint))
         elif thrown.length_m < _THROWN_CELLS * cell:
             self.left_out.append(
@@ -786,7 +814,7 @@ def spectrum_sign_evidence(
         return SignEvidence(sign, 0.0, 0.0), stated
     best = stated.best.evidence if stated.best is not None else 0.0
     # What is only faint proves nothing before as much was looked for under the other sign.
-    other = _search(turned, camera, extent, twice=stated.is_faint)
+    other = _search(turned, camera, extent, twice=stated.is_faint, rises=True)
     if leaving := [left for left in other.left_out if left.reason.startswith(LEAVES)]:
         best = 0.0
         doubts = (replace(left, reason=f"{OTHER_SIGN} {left.reason}") for left in leaving)
@@ -796,7 +824,7 @@ def spectrum_sign_evidence(
     plain = [
         (target, thrown.is_one_sided and not thrown.length_m < least_m)
         for target, thrown in zip(other.targets, other.thrown, strict=True)
-        if not thrown.front >= _PLAIN
+        if not thrown.front >= _PLAIN and not thrown.shading.may_be_relief
     ]
     contrary = [target for target, proves in plain if proves]
     against = max((target.evidence for target in contrary), default=0.0)
