@@ -100,6 +100,10 @@ _PLAIN = 1.5
 #: shifted by 1.5 cells towards the sonar, or away from it, seems to throw its dark patches' shadows. At half
 #: one of 84 seabeds of the development half (scenes 120 to 330) is refused, with a patch of 13 dB.
 _CONTRARY_CELLS = 2.0
+#: Only what throws its shadow so far (cells of a view of the search) can be told from a rise of the seabed:
+#: blurred over a cell, echo and shadow of a brick's edge go with the aspect as the faces of a slope do. At
+#: half four of 12 bricks, with shadows of 1.3 to 1.8 cells, are candidates only; at double mounds are bodies.
+_RISE_CELLS = 2.0
 #: The other sign must explain this many times more body than the stated one to be called the right one.
 _SIGN_RATIO = 4.0
 
@@ -520,6 +524,8 @@ class Judged:
     ) -> None:
         """Take a body in by the shadow that it throws, so many cells at least."""
         target, thrown = body.target(), body.thrown(looks)
+        if thrown.shading.stands:  # however much of its foot is lost
+            target = replace(target, stands=True)
         x, y = target.position_m
         cell = cell_m(looks)
         if faint and (thrown.length_m < least_cells * cell or not thrown.power < _NOT_CAST):
@@ -531,7 +537,7 @@ class Judged:
             return
         self.plans.append(body.voxels[1:])
         told = f"dark by {thrown.contrast_db:.0f} dB, "
-        if thrown.shading.is_rise and not self.rises:
+        if thrown.shading.is_rise and thrown.length_m >= _RISE_CELLS * cell and not self.rises:
             told += "and as bright on the side of the sonar: the seabed rises, or a low body"
             self.left_out.append(LeftOut((x, y), told, strong=True))
         elif thrown.power <= _CAST and thrown.shading.is_hollow:
@@ -548,7 +554,7 @@ class Judged:
                     strong=True,
                 )
             )
-        elif thrown.power <= _CAST:
+        elif thrown.power <= _CAST or (thrown.power < _NOT_CAST and thrown.shading.is_body):
             (self.found if target.stands else self.hanging).append((target, thrown, faint))
         elif not thrown.power < _NOT_CAST:
             self.left_out.append(
