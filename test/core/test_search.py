@@ -67,12 +67,9 @@ def test_a_hollow_that_dark_sediment_fills_is_no_wrong_sign_and_no_object(radius
     assert any("a hollow in" in reason for reason in result.quality.reasons)
 
 
-@pytest.mark.parametrize(
-    ("radius_m", "steep"),
-    [(0.5, 0.5), (0.5, 0.75), (0.7, 0.5), (0.7, 0.67), (0.7, 0.75)],
-)
+@pytest.mark.parametrize(("radius_m", "steep"), [(0.5, 0.45), (0.5, 0.5), (0.7, 0.45), (0.7, 0.5)])
 def test_a_rise_too_flat_for_a_shadow_is_a_candidate_and_no_object(radius_m, steep):
-    """The sonar sees the seabed at 22°; the side of the rise away from it is up to 12 dB darker."""
+    """The sonar sees the seabed at 22°; the side of the rise away from it is up to 6 dB darker."""
     height_m = steep * 0.4 * radius_m * 2.0 / np.pi
     rise = seabed_alone(Seabed(bumps=(Bump(PLACE, radius_m, height_m),)))
     result = run(rise.image, rise.track, COARSE)

@@ -100,10 +100,13 @@ _PLAIN = 1.5
 #: shifted by 1.5 cells towards the sonar, or away from it, seems to throw its dark patches' shadows. At half
 #: one of 84 seabeds of the development half (scenes 120 to 330) is refused, with a patch of 13 dB.
 _CONTRARY_CELLS = 2.0
-#: Only what throws its shadow so far (cells of a view of the search) can be told from a rise of the seabed:
-#: blurred over a cell, echo and shadow of a brick's edge go with the aspect as the faces of a slope do. At
-#: half four of 12 bricks, with shadows of 1.3 to 1.8 cells, are candidates only; at double mounds are bodies.
-_RISE_CELLS = 2.0
+#: Only what throws its shadow so far (cells of a view of the search), and is no darker than this (power over
+#: the seabed's), may be a rise of the seabed: blurred over a cell, echo and shadow of a brick's edge go with
+#: the aspect as the faces of a slope do, but a slope that shadows nothing is not as dark as a shadow. Mounds
+#: found in the development half have 2.2 to 3.5 cells and 0.24 to 0.44, bricks with shadows of 1.3 to 2.6
+#: cells and 10 dB or more 0.10 to 0.20. At half of either, bricks of 1.6 to 2.0 m are candidates only; at
+#: double, mounds are bodies.
+_RISE_CELLS, _RISE_POWER = 2.0, 0.2
 #: The other sign must explain this many times more body than the stated one to be called the right one.
 _SIGN_RATIO = 4.0
 
@@ -166,6 +169,11 @@ class Thrown:
     def contrast_db(self) -> float:
         """Contrast of the core below the seabed."""
         return -10.0 * math.log10(max(self.core, 1e-3))
+
+    def is_rise(self, cell_m: float) -> bool:
+        """Say whether a rise of the seabed explains it, in cells of so many metres."""
+        plain = self.length_m >= _RISE_CELLS * cell_m and self.core >= _RISE_POWER
+        return plain and self.shading.is_rise
 
     @property
     def is_one_sided(self) -> bool:
@@ -524,7 +532,7 @@ class Judged:
     ) -> None:
         """Take a body in by the shadow that it throws, so many cells at least."""
         target, thrown = body.target(), body.thrown(looks)
-        if thrown.shading.stands:  # however much of its foot is lost
+        if faint and thrown.shading.stands:  # however much of its foot is lost: nothing looks for it again
             target = replace(target, stands=True)
         x, y = target.position_m
         cell = cell_m(looks)
@@ -537,7 +545,7 @@ class Judged:
             return
         self.plans.append(body.voxels[1:])
         told = f"dark by {thrown.contrast_db:.0f} dB, "
-        if thrown.shading.is_rise and thrown.length_m >= _RISE_CELLS * cell and not self.rises:
+        if not self.rises and thrown.is_rise(cell):
             told += "and as bright on the side of the sonar: the seabed rises, or a low body"
             self.left_out.append(LeftOut((x, y), told, strong=True))
         elif thrown.power <= _CAST and thrown.shading.is_hollow:
