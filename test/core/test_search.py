@@ -423,6 +423,42 @@ def test_what_is_as_dark_before_it_as_behind_it_is_sediment_or_stands_on_it(fron
     assert all("sediment, or a body on it" in left.reason for left in judged.left_out)
 
 
+@pytest.mark.parametrize(
+    ("left", "outward", "cells", "power", "core", "came_to"),
+    [
+        (0.5, 0.9, 3.0, 0.3, 0.3, "found"),
+        (0.5, 0.3, 3.0, 0.3, 0.3, "hanging"),  # where other bodies' shadows cross
+        (0.5, 0.9, 3.0, 0.45, 0.3, "found"),
+        (0.5, 0.3, 3.0, 0.45, 0.3, "sediment, or a body"),
+        (0.05, 0.9, 3.0, 0.45, 0.3, "sediment, or a body"),
+        (0.0, 0.9, 3.0, 0.3, 0.3, "the seabed rises, or a low body"),
+        (0.0, 0.9, 1.6, 0.3, 0.3, "found"),  # a low body's edge, blurred, is as a slope
+        (0.0, 0.9, 3.0, 0.3, 0.12, "found"),  # as dark as a shadow
+        (0.0, 0.5, 3.0, 0.3, 0.3, "hanging"),
+        (0.0, -0.6, 3.0, 0.3, 0.3, "a hollow in dark seabed"),
+    ],
+)
+def test_a_faint_body_is_judged_by_its_sides(left, outward, cells, power, core, came_to):
+    """One that seems to hang, beside a body that stands."""
+    made = simulate("tiny", "empty", seed=2)
+    looks = search_image(made.image, made.track, Spectrum.of_image(made.image)).looks
+    thrown = Thrown(cells * cell_m(looks), power, core, 1.2, Shading(left, outward))
+    body = SimpleNamespace(
+        target=lambda: Target(PLACE, (0.4, 0.4, 0.2), 1e-3, stands=False),
+        thrown=lambda looks: thrown,
+        voxels=(np.arange(2), np.arange(2), np.arange(2)),
+    )
+    judged = Judged()
+    judged.add(body, looks, faint=True)
+    assert [target.stands for target, _, _ in judged.found] == [True] * (came_to == "found")
+    assert len(judged.hanging) == (came_to == "hanging")
+    assert [came_to in left_out.reason for left_out in judged.left_out] == [True] * (len(came_to) > 7)
+    # The other way round a rise is a hollow, which the sign's evidence has to hear of.
+    turned = Judged(rises=True)
+    turned.add(body, looks, faint=True)
+    assert not any("rises" in left_out.reason for left_out in turned.left_out)
+
+
 @pytest.mark.parametrize(("length_cells", "front"), [(3.0, 1.0), (1.2, 1.0), (3.0, 0.4)])
 def test_what_is_faint_raises_a_doubt_of_the_sign_even_where_it_would_prove_nothing(
     monkeypatch, length_cells, front

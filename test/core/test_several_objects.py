@@ -11,13 +11,14 @@ from core_data import COARSE_SONAR
 
 from csas_shadow_ros.core import pipeline
 from csas_shadow_ros.core.errors import ParameterError
+from csas_shadow_ros.core.imaging.subaperture import Spectrum
 from csas_shadow_ros.core.parameters import (
     CarvingParameters,
     PipelineParameters,
     SubApertureParameters,
     TargetParameters,
 )
-from csas_shadow_ros.core.search.bodies import Search, stands_on_seabed
+from csas_shadow_ros.core.search.bodies import Search, search_image, stands_on_seabed
 from csas_shadow_ros.core.search.decision import decide
 from csas_shadow_ros.core.search.pieces import connected_pieces, objects_of, overlap_share
 from csas_shadow_ros.core.shape.volume import Target, Volume, VoxelGrid
@@ -159,6 +160,27 @@ def test_a_low_wide_body_beside_another_is_an_object_too(height_m):
     assert (found.length_m, found.width_m) == pytest.approx((1.9, 1.8), abs=0.3)
     low, high = found.intervals["height_m"]
     assert low <= height_m <= high
+
+
+@pytest.mark.parametrize(
+    ("contrast_db", "echo_db", "seed", "found"), [(8.0, 12.0, 7, 0), (8.0, 12.0, 8, 0), (11.0, 14.0, 10, 1)]
+)
+def test_a_faint_low_body_whose_foot_is_lost_is_found_or_named_beside_another(
+    contrast_db, echo_db, seed, found
+):
+    """It seemed to hang, as what is where shadows of others cross, and went unsaid."""
+    bodies = box(1.0, 0.6, 0.6), box(2.1, 1.8, 0.28)
+    for body, place in zip(bodies, ((-1.3, -0.6), (1.2, 0.4)), strict=True):
+        body.apply_translation([*place, 0.0])
+    faults = Faults(contrast_db=contrast_db)
+    made = simulate(COARSE_SONAR, join_bodies(bodies), seed=seed, faults=faults, echo_db=echo_db, workers=1)
+    search = search_image(made.image, made.track, Spectrum.of_image(made.image))
+
+    def near(those):
+        return [one for one in those if np.hypot(*np.subtract(one.position_m, (1.2, 0.4))) < 0.5]
+
+    assert [target.stands for target in near(search.targets)] == [True] * found
+    assert [left.strong for left in near(search.left_out)] == [True] * (1 - found)
 
 
 def test_a_body_of_which_carving_leaves_crumbs_is_a_candidate():
