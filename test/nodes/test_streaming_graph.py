@@ -151,7 +151,7 @@ def test_the_target_of_an_open_circle_moves_when_it_is_closed_and_all_is_carved_
     graph: Graph, sector_bag: Path, reference_of_sectors: Result
 ) -> None:
     nodes = streaming_graph(graph, sector_bag, 30.0)
-    graph.spin_until(lambda: nodes["carver"].state_counts()["views"] >= 1)  # soon: sectors come at their rate
+    graph.spin_until(lambda: nodes["carver"].state_counts()["views"] >= 1)  # sectors do not wait for views
     assert nodes["sub_aperture"].state_counts()["arc_deg"] < 360
     first = nodes["carver"].target.target
     graph.spin_until(complete(nodes), 60.0)

@@ -34,7 +34,7 @@ from ..parameters import (
 from ..shape.carving import Carver
 from ..shape.result import OTHER_SIGN, LeftOut
 from ..shape.volume import MARGIN_SHARE, Target, Volume
-from .relief import Shading, shading
+from .relief import UNSEEN, Shading, shading
 
 #: Aperture (deg) of the views that search: narrow enough that shadows stay sharp without enhancement.
 _SEARCH_APERTURE_DEG = 6.0
@@ -104,8 +104,9 @@ _CONTRARY_CELLS = 2.0
 #: the seabed's), may be a rise of the seabed: blurred over a cell, echo and shadow of a brick's edge go with
 #: the aspect as the faces of a slope do, but a slope that shadows nothing is not as dark as a shadow. Mounds
 #: found in the development half have 2.2 to 3.5 cells and 0.24 to 0.44, bricks with shadows of 1.3 to 2.6
-#: cells and 10 dB or more 0.10 to 0.20. At half of either, bricks of 1.6 to 2.0 m are candidates only; at
-#: double, mounds are bodies.
+#: cells and 10 dB or more 0.10 to 0.20. Of ten mounds and 22 bricks, half of the first makes a rise of one
+#: more mound, half of the second of three bricks; at double of the first all mounds are bodies, of the second
+#: six.
 _RISE_CELLS, _RISE_POWER = 2.0, 0.2
 #: The other sign must explain this many times more body than the stated one to be called the right one.
 _SIGN_RATIO = 4.0
@@ -163,7 +164,7 @@ class Thrown:
     power: float
     core: float
     front: float
-    shading: Shading
+    shading: Shading = UNSEEN
 
     @property
     def contrast_db(self) -> float:
@@ -382,11 +383,12 @@ class _Body:
         powers = self._powers(looks)
         known = np.sort(powers[np.isfinite(powers)])[:_MIN_VOXELS]
         core = float(known.mean()) if known.size else 1.0
-        whole = self._thrown(looks, core, np.ones(len(powers), np.bool_))
-        if whole.power <= _CAST:
-            return whole
-        part = self._thrown(looks, core, powers < core + _STRICT * (1.0 - core))
-        return part if part.power <= _CAST and part.length_m >= _THROWN_CELLS * cell_m(looks) else whole
+        told = self._thrown(looks, core, np.ones(len(powers), np.bool_))
+        if not told.power <= _CAST:
+            part = self._thrown(looks, core, powers < core + _STRICT * (1.0 - core))
+            if part.power <= _CAST and part.length_m >= _THROWN_CELLS * cell_m(looks):
+                told = part
+        return replace(told, shading=self._shading(looks, told.length_m))
 
     def _powers(self, looks: Sequence[Look]) -> NDArray[np.float64]:
         """Mean power of each voxel's shadow, the seabed's 1; NaN where no view knows it."""
@@ -424,7 +426,7 @@ class _Body:
         length = float(np.median(lengths))
         share = (off - core) / max(1.0 - core, 1e-3)
         front = float(np.median(fronts))
-        return Thrown(length, share, core, front, self._shading(looks, length))
+        return Thrown(length, share, core, front)
 
     def _shading(self, looks: Sequence[Look], length_m: float) -> Shading:
         """Look at a disc round its plan, as far off it as its shadow reaches."""
@@ -532,50 +534,41 @@ class Judged:
     ) -> None:
         """Take a body in by the shadow that it throws, so many cells at least."""
         target, thrown = body.target(), body.thrown(looks)
-        if faint and thrown.shading.stands:  # however much of its foot is lost: nothing looks for it again
-            target = replace(target, stands=True)
-        x, y = target.position_m
         cell = cell_m(looks)
         if faint and (thrown.length_m < least_cells * cell or not thrown.power < _NOT_CAST):
             return  # texture of the seabed, which every scene has
+        if faint and thrown.shading.stands:  # however much of its foot is lost: nothing looks for it again
+            target = replace(target, stands=True)
+
+        def doubt(why: str) -> None:
+            told = f"dark by {thrown.contrast_db:.0f} dB, {why}"
+            self.left_out.append(LeftOut(target.position_m, told, strong=True))
+
         if thrown.power <= _CAST and not thrown.is_one_sided:
             # Over the local seabed a body on dark sediment may still stand out.
-            told = f"dark by {thrown.contrast_db:.0f} dB, before it as where its shadow must fall"
-            self.left_out.append(LeftOut((x, y), f"{told}: sediment, or a body on it", strong=True))
+            doubt("before it as where its shadow must fall: sediment, or a body on it")
             return
         self.plans.append(body.voxels[1:])
-        told = f"dark by {thrown.contrast_db:.0f} dB, "
         if not self.rises and thrown.is_rise(cell):
-            told += "and as bright on the side of the sonar: the seabed rises, or a low body"
-            self.left_out.append(LeftOut((x, y), told, strong=True))
+            doubt("and as bright on the side of the sonar: the seabed rises, or a low body")
         elif thrown.power <= _CAST and thrown.shading.is_hollow:
-            told += "and bright on the far side: a hollow in dark seabed"
-            self.left_out.append(LeftOut((x, y), told, strong=True))
+            doubt("and bright on the far side: a hollow in dark seabed, or the wrong spectrum_sign")
         elif not target.stands and not faint:
             self.found.append((target, thrown, faint))
         elif thrown.length_m < _THROWN_CELLS * cell:
-            self.left_out.append(
-                LeftOut(
-                    (x, y),
-                    f"dark by {thrown.contrast_db:.0f} dB, but throws its shadow {thrown.length_m:.2f} m far:"
-                    f" sediment, or too low to tell; expected a shadow of {_THROWN_CELLS * cell:.2f} m",
-                    strong=True,
-                )
+            doubt(
+                f"but throws its shadow {thrown.length_m:.2f} m far: sediment, or too low to tell;"
+                f" expected a shadow of {_THROWN_CELLS * cell:.2f} m"
             )
         elif thrown.power <= _CAST or (thrown.power < _NOT_CAST and thrown.shading.is_body):
             (self.found if target.stands else self.hanging).append((target, thrown, faint))
         elif not thrown.power < _NOT_CAST:
-            self.left_out.append(
-                LeftOut((x, y), "dark sediment: the same seabed is dark from all sides, no shadow moves")
-            )
+            why = "dark sediment: the same seabed is dark from all sides, no shadow moves"
+            self.left_out.append(LeftOut(target.position_m, why))
         else:
-            self.left_out.append(
-                LeftOut(
-                    (x, y),
-                    f"dark by {thrown.contrast_db:.0f} dB, but {100 * thrown.power:.0f} % lit where its"
-                    f" shadow must fall: sediment, or a body; expected at most {100 * _CAST:.0f} %",
-                    strong=True,
-                )
+            doubt(
+                f"but {100 * thrown.power:.0f} % lit where its shadow must fall: sediment, or a body;"
+                f" expected at most {100 * _CAST:.0f} %"
             )
 
 

@@ -18,13 +18,17 @@ from numpy.typing import NDArray
 #: Energy that level and first harmonic may leave (share of the harmonic's): of what is no body, and of what
 #: proves no wrong sign. Mounds of the development half leave -0.03 to 0.01, of 45 more random seabeds to
 #: 0.03, hollows -0.05 to 0.09; bodies whose shadow is two cells long 0.03 (a brick), 0.046 (a wedge) and
-#: more. At half of the first two mounds of a dozen stay bodies, at double a brick of 12 is a rise. At half
-#: of the second hollows in dark sediment prove a wrong sign, at double boxes with bright echoes do not.
+#: more. Of ten mounds and 22 bricks, half of the first changes none, and double makes rises of two bricks. At
+#: half of the second one of six hollows in dark sediment proves a wrong sign; at double boxes with bright
+#: echoes do not.
 _LEFT, _MAY_LEAVE = 0.02, 0.08
 #: Round a mound or a body places are bright from their own side of the middle: mounds have 0.83 to 0.99, the
-#: weakest 0.68, pipes, whose ends tell no side, 0.14 to 0.5, sediment -0.2 to 0.1, hollows -0.65. At half a
-#: pipe may be a rise; at 1 no mound is.
+#: weakest 0.68, pipes, whose ends tell no side, 0.14 to 0.5, sediment -0.2 to 0.1. Half of it changes none of
+#: the ten mounds and 22 bricks; double is more than there can be.
 _OUTWARD = 0.7
+#: In hollows they are bright from the other side: -0.65 to -0.8. At half a piece beside a rock (scene 295 of
+#: the development half) counts as one; at double the hollow of -0.65 is a body.
+_INWARD = -0.35
 #: Looks further apart than this (rad; 1.5 steps of the search) say nothing of the speckle between them.
 _NEXT_RAD = np.radians(15.0)
 #: A place needs so many looks: level, sine and cosine take three.
@@ -71,7 +75,11 @@ class Shading:
     @property
     def is_hollow(self) -> bool:
         """Whether its far side is bright: that of a body is dark."""
-        return self.outward < -_OUTWARD / 2.0
+        return self.outward < _INWARD
+
+
+#: Nothing was looked at.
+UNSEEN = Shading(float("nan"), float("nan"))
 
 
 def shading(
