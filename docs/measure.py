@@ -485,7 +485,7 @@ def _own_support(sides: Sequence[SilhouetteSides]) -> NDArray[np.float64]:
 #: The measures with one step left out or taken otherwise.
 MEASURES: dict[str, dict[str, Any]] = {
     "default": {},
-    "  each view alone": {"_agreed_support": _own_support},
+    "  each view alone": {"agreed_support": _own_support},
     "  the sides beside alone": {"_ALL_SIDES": 0.0},
     "  no foot": {"_FLARE_PX": math.inf},
     "  no upright walls": {"_MOST": 1.0},

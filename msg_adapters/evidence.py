@@ -43,6 +43,7 @@ def _status(one: ViewEvidence) -> Status:
         "height_m": one.height_m,
         "unexplained": one.unexplained,
         "lit": one.lit,
+        "shift_m": one.shift_m,
     }
     return Status.of(str(int(one.stamp_ns)), values)
 
@@ -71,5 +72,6 @@ def evidence_from_msg(msg: Any) -> dict[int, ViewEvidence]:
             height_m=status.real("height_m"),
             unexplained=status.real("unexplained") if "unexplained" in status else math.nan,
             lit=status.real("lit") if "lit" in status else math.nan,
+            shift_m=status.real("shift_m", finite=True) if "shift_m" in status else 0.0,
         )
     return found

@@ -7,6 +7,7 @@ goes by the views' stamps: whoever feeds the same views gets the same result.
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections import OrderedDict
@@ -29,10 +30,12 @@ from .imaging.segmentation import require_silhouette
 from .parameters import PipelineParameters
 from .search.decision import Decision
 from .search.pieces import APART_CELLS, is_same_body, nothing_left, objects_of, without_neighbours
+from .shape.alignment import shifts_across
 from .shape.carving import Carver, compared_shadows
 from .shape.explained import ShadowFit, mean_fit
 from .shape.hollows import EchoLook, matter_mesh, matter_of
 from .shape.measurement import (
+    ONE_PLAN_CELLS,
     SilhouetteSides,
     doubted,
     levels_of_mask,
@@ -217,6 +220,20 @@ class Body:
             return self.carver.shadow_fits(grids)
         used = {stamp: kept for stamp, kept in self._shown.items() if stamp in self.carver.stamps}
         return compared_shadows(used, grids)
+
+    def moved_back(self, shifts_m: Mapping[int, float]) -> Body:
+        """Return the body as its views show it once those that lie beside their place are put back."""
+
+        def back(info: ViewInfo) -> ViewInfo:
+            return info.moved_back(shifts_m.get(info.stamp_ns, 0.0))
+
+        moved = copy.copy(self)
+        moved.carver = self.carver.moved_back(shifts_m)
+        moved.infos = {stamp: back(info) for stamp, info in self.infos.items()}
+        moved.looks = {stamp: replace(look, info=back(look.info)) for stamp, look in self.looks.items()}
+        moved.sides = {side.info.stamp_ns: side.moved_back(shifts_m) for side in self.known_sides()}
+        moved._masks = {}
+        return moved
 
     def known_sides(self) -> list[SilhouetteSides]:
         """Return the sides of the views in the grid; of a silhouette that came alone it tells them itself."""
@@ -453,7 +470,32 @@ class Reconstruction:
         final : bool
             Whether no more views are to come. Until then carving looks once, and nothing is said of
             intervals, hollows and further bodies: a few ms instead of a second.
+
+        Notes
+        -----
+        Views that lie beside one another across range are put together and carved again (`alignment`).
         """
+        result = self._result(final=final)
+        shifts_m = self._shifts_across(result)
+        return self._moved_back(shifts_m)._result(final=final) if shifts_m else result
+
+    def _shifts_across(self, result: Result) -> dict[int, float]:
+        """Return how far each view lies beside its place, by stamp; empty where the sides bound one plan."""
+        found = result.dimensions
+        if found is None or result.grid is None or not found.scatter_cells > ONE_PLAN_CELLS:
+            return {}
+        return shifts_across(result.sides, result.grid) if self.bodies[0].carver.keeps_masks else {}
+
+    def _moved_back(self, shifts_m: Mapping[int, float]) -> Reconstruction:
+        """Return the same scene from views of which those that lie beside their place are put back."""
+        moved = copy.copy(self)
+        moved.bodies = [
+            body.moved_back(shifts_m) if body.carver.keeps_masks else body for body in self.bodies
+        ]
+        return moved
+
+    def _result(self, *, final: bool) -> Result:
+        """Return the result so far, each view where it lies."""
         began = time.perf_counter()
         result = Result(
             run_ns=self.run_ns,
@@ -513,6 +555,7 @@ class Reconstruction:
         result.mesh, result.dimensions = _measured(
             result.grid, () if result.by_likelihood_alone else result.sides, final=True
         )
+        shifts_m = {side.info.stamp_ns: side.shift_m for side in result.sides}
         heights = {}
         if (found := result.dimensions) is not None:
             heights = {side.info.stamp_ns: shadow_height(side, found) for side in result.sides}
@@ -527,6 +570,7 @@ class Reconstruction:
                 contrast,
                 estimated,
                 heights.get(stamp, math.nan),
+                shift_m=shifts_m.get(stamp, 0.0),
             )
 
     def _compare_shadows(self, result: Result) -> None:

@@ -219,6 +219,7 @@ def _shadow_heights(result: Result) -> dict[str, Any] | None:
                 "height_m": one.height_m,
                 "unexplained": one.unexplained,
                 "lit": one.lit,
+                "shift_m": one.shift_m,
             }
             for one in told
         ],

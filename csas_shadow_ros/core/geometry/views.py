@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -93,6 +93,17 @@ class ViewInfo:
         start = to_ground[:2] @ np.array([(self.camera.cols - 1) / 2.0, 0.0, 1.0])
         rows = np.arange(self.camera.rows, dtype=np.float64)
         return float(e_r @ start) + rows * float(e_r @ to_ground[:2, 1])
+
+    def moved_back(self, shift_m: float) -> ViewInfo:
+        """Return the geometry that puts a view back that shows everything so far along e_c, m."""
+        if not shift_m:
+            return self
+        to_pixel = self.camera.ground_to_pixel.copy()
+        to_pixel[0, 2] += shift_m / self.camera.spacing_m[1]
+        camera = ShadowCamera.from_ground(
+            to_pixel, self.camera.sonar_m, self.camera.rows, self.camera.cols
+        )
+        return replace(self, camera=camera)
 
 
 @dataclass(frozen=True, eq=False)

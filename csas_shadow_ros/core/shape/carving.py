@@ -62,6 +62,8 @@ _EXPLAINED = 0.05
 #: those that would lose (tables, crates, a rock, a pole) -0.13 to 0.011. At half a rock loses 0.05, at double
 #: a cone of 5 dB 0.14.
 _NET_EXPLAINED = 0.012
+#: What it casts on lit seabed counts so often.
+_LIT_COUNTS = 2.0
 #: And less than this share of its views contradicts most of what comes back: a face is lit from half of the
 #: circle at most, the seabed between bodies from nearly all of it. Of bodies of the development half 0.04 to
 #: 0.31 do so; of a frame in its laying grid 0.55, where a slab of the grid's size would explain all shadows.
@@ -677,12 +679,20 @@ class Carver:
 
     def _over(self, slope: SeabedSlope) -> Carver:
         """Carve the same masks again, over a seabed that slopes."""
-        over = Carver(self.volume, self.parameters, pool=self._pool)
+        return self._seen_by(slope.applied)
+
+    def moved_back(self, shifts_m: Mapping[int, float]) -> Carver:
+        """Carve the same masks again, views that lie beside their place put back (`alignment`)."""
+        return self._seen_by(lambda info: info.moved_back(shifts_m.get(info.stamp_ns, 0.0)))
+
+    def _seen_by(self, change: Callable[[ViewInfo], ViewInfo]) -> Carver:
+        """Carve the same masks again, the geometry of their views changed."""
+        again = Carver(self.volume, self.parameters, pool=self._pool)
         for stamp, kept in self._masks.items():
-            over._masks[stamp] = KeptMask(slope.applied(kept.info), kept.packed)
-            over._sums.add_mask(kept.view().pixels, over._masks[stamp].info)
-        over.stamps = set(self.stamps)
-        return over
+            again._masks[stamp] = KeptMask(change(kept.info), kept.packed)
+            again._sums.add_mask(kept.view().pixels, again._masks[stamp].info)
+        again.stamps = set(self.stamps)
+        return again
 
     def _again(self, change: Callable[[KeptMask], KeptMask]) -> Carver:
         """Carve the same views again, their masks changed: only what these changes change is looked up."""
@@ -776,10 +786,11 @@ class Carver:
         whole = self._with(body, left, left.occupied & plan.columns(self.volume) & ~body.occupied)
         faces = self._mostly_under(_FACING, body, whole.occupied & ~body.occupied)
         fit = self.misfit([whole, *others]) if unexplained >= _EXPLAINED else (math.nan, math.nan)
-        explained = unexplained - fit[0]
+        explained, more_lit = unexplained - fit[0], fit[1] - lit
         # What shines through under a slab would be lit by more than its shadows explain.
         if explained >= _EXPLAINED and (
-            faces or (explained >= fit[1] - lit and self._dark_on(plan) < _DARK_TOP)
+            (faces and unexplained > _LOST)
+            or (not faces and explained >= more_lit and self._dark_on(plan) < _DARK_TOP)
         ):
             return whole
         filled = body
@@ -787,8 +798,9 @@ class Carver:
         if np.count_nonzero(below) >= _UNDERCUT * count and self._mostly_under(_SELDOM, body, below):
             filled = self._with(body, whole, below)
         if faces and unexplained >= _EXPLAINED:
-            more = sum(self.misfit([filled, *others])) - sum(fit)
-            return whole if more >= _NET_EXPLAINED else filled
+            left, lit = self.misfit([filled, *others])
+            net = left - fit[0] - _LIT_COUNTS * (fit[1] - lit)
+            return whole if net >= _NET_EXPLAINED else filled
         return filled
 
     @staticmethod

@@ -20,7 +20,7 @@ where the cap begins, and a dome's, and its interval holds the cap.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -94,11 +94,11 @@ _VOXEL_WEIGHT, _VOXEL_ALONE = 0.1, 1.0
 #: whose shadow touches the target's.
 _FOREIGN_CELLS = 3.0
 #: Fewer edges than this give no plan: the voxels alone are measured then.
-_MIN_EDGES = 24
+MIN_EDGES = 24
 #: Sides that scatter about the fitted plan by more than this (cross-range cells, 1σ) are not those of one
 #: plan: edges are found to a fraction of a cell. Simulated targets scatter by 0.19 to 0.57, the chips of a
 #: measured vehicle, which were cut out one by one (docs/examples.md), by 1.5.
-_ONE_PLAN_CELLS = 1.0
+ONE_PLAN_CELLS = 1.0
 #: Parts of a plan that are thinner than this are not measured where the sides scatter so (cross-range cells).
 #: The measured vehicle of docs/examples.md is 7.74 m long with its crumbs and 6.96 m without (its hull has
 #: 6.95 m); at half 7.02 m, at double 6.76 m.
@@ -170,6 +170,8 @@ class SilhouetteSides:
         as one that is drawn by hand.
     echo_support_m : tuple of float
         The support of each side as the target's own echo tells it, m; NaN where none is seen.
+    shift_m : float
+        How far along e_c the view lay from its place before it was put back, m (`alignment`).
     """
 
     info: ViewInfo
@@ -181,6 +183,36 @@ class SilhouetteSides:
     cut: bool = False
     contour: Contour | None = None
     echo_support_m: tuple[float, ...] = ()
+    shift_m: float = 0.0
+
+    @property
+    def signs(self) -> tuple[int, ...]:
+        """Whether each side faces along e_c (1) or against it (-1)."""
+        across = cross_range_axis(self.info.aspect_rad)
+        faces = (math.cos(phi) * across[0] + math.sin(phi) * across[1] for phi in self.direction_rad)
+        return tuple(1 if face > 0.0 else -1 for face in faces)
+
+    def moved_back(self, shifts_m: Mapping[int, float]) -> SilhouetteSides:
+        """Return the sides of the view put back that lies so far along e_c (by stamp, m) from its place."""
+        shift = shifts_m.get(self.info.stamp_ns, 0.0)
+        back = np.array([-sign * shift for sign in self.signs])
+
+        def moved(told: Sequence[float]) -> tuple[float, ...]:
+            return tuple((np.array(told) + back[: len(told)]).tolist())
+
+        contour = self.contour
+        return replace(
+            self,
+            info=self.info.moved_back(shift),
+            support_m=moved(self.support_m),
+            support_by_shape_m=tuple(
+                tuple((np.array(each) + by).tolist())
+                for each, by in zip(self.support_by_shape_m, back, strict=False)
+            ),
+            contour=contour and replace(contour, across_m=tuple(x - shift for x in contour.across_m)),
+            echo_support_m=moved(self.echo_support_m),
+            shift_m=self.shift_m + shift,
+        )
 
 
 def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) -> SilhouetteSides | None:
@@ -348,7 +380,7 @@ def _fitted_side(
     return curves, shape, slope
 
 
-def _agreed_support(sides: Sequence[SilhouetteSides]) -> FloatArray:
+def agreed_support(sides: Sequence[SilhouetteSides]) -> FloatArray:
     """Return the supports of all sides, each taken for the shape that the sides beside it and all sides have.
 
     Speckle roughens edges, so that one view alone is wrong about a side in six, and a straight side that is
@@ -430,6 +462,12 @@ class PlanFit:
         Directions (rad) that `solve` answers for.
     kept : ndarray of bool
         Which sides take part: not those that stand out of the voxels.
+    spread_m : float
+        How far these scatter about the plan, 1σ, m, once it is solved for.
+    beyond_m : ndarray of float, shape (count,)
+        How far each of these lies outside of the plan then, m.
+    counts : ndarray of bool, shape (count,)
+        Which of these are not outliers then.
     """
 
     def __init__(
@@ -443,7 +481,7 @@ class PlanFit:
         seen: FloatArray = np.array(pairs, dtype=np.float64).reshape(-1, 4)
         # The fit makes 1e-4 m of the FFT's rounding, 1e-9 m: to a hundredth of a voxel the same image leaves
         # the same sides, whether it came whole or as a sum of sectors. Edges are ten times less sure.
-        told = _agreed_support(sides) if support_m is None else support_m
+        told = agreed_support(sides) if support_m is None else support_m
         seen[:, 1] = np.round(told, digits_of(grid.volume.voxel_size_m))
         self.directions: FloatArray = _round_circle(_FINE_DIRECTIONS)
         coarse = _round_circle(_DIRECTIONS)
@@ -466,8 +504,9 @@ class PlanFit:
         weights = np.where(alone, _VOXEL_ALONE, _VOXEL_WEIGHT)
         self._weights = np.concatenate([np.ones(self.count), weights])
         self._robust = np.ones_like(self._weights)
-        #: How far sides scatter about the plan, 1σ, m.
         self.spread_m = 0.0
+        self.beyond_m = np.zeros(self.count)
+        self.counts = np.ones(self.count, np.bool_)
         self.view_of = seen[:, 3].astype(np.intp)
         self._face(coarse)
         radii = self._solve(self._weights)[: len(coarse)]
@@ -514,6 +553,8 @@ class PlanFit:
             residual = (self._values - self._design @ solution)[: self.count]
             spread = self.spread_m = 1.4826 * float(np.median(np.abs(residual))) + 1e-4
             self._robust[: self.count] = np.sqrt(np.clip(1.0 - (residual / (4.0 * spread)) ** 2, 0.0, None))
+        self.beyond_m = (self._values - self._design @ solution)[: self.count]
+        self.counts = self._robust[: self.count] > 0.0
         return np.asarray(self._basis(self.directions) @ solution)
 
     def resampled(self, share: FloatArray) -> FloatArray:
@@ -802,9 +843,9 @@ def measure_object(
     """
     whole = measure(mesh)
     sides = sorted(sides, key=lambda side: side.info.stamp_ns)
-    by_shadows = _agreed_support(sides)
+    by_shadows = agreed_support(sides)
     fit = PlanFit(sides, grid, by_shadows)
-    if fit.count < _MIN_EDGES:
+    if fit.count < MIN_EDGES:
         return whole
     support = fit.solve()
     # Shadows alone tell whether there is one plan: echoes would hide that they do not agree.
@@ -820,7 +861,7 @@ def measure_object(
     down, across = (float(np.median([s.info.resolution_m[axis] for s in sides])) for axis in (0, 1))
     edge = _EDGE_CELLS * across
     d = grid.volume.voxel_size_m
-    if spread_m > _ONE_PLAN_CELLS * across:
+    if spread_m > ONE_PLAN_CELLS * across:
         # No one plan has these sides, as where each view lies at a place of its own: the voxels, which a few
         # views do not move, are what all agree on.
         solid = _without_thin_parts(grid, _THIN_CELLS * across)
@@ -846,7 +887,11 @@ def measure_object(
         height, sigma = told.height_m, math.hypot(told.sigma_m, d / 2.0)
     elif height is None:
         # Flat or round: half-way. The true top lies anywhere in the cap, or where half of the views end.
-        height = standing_height(sides, measured, grid, sigma) or _cap_height(cap, down * math.tan(grazing))
+        height = standing_height(sides, measured, grid, sigma)
+        # Views that lay beside one another across range also do so down-range, which nothing tells: half of
+        # them keep more of a top for that alone.
+        share = 0.0 if any(side.shift_m for side in sides) else _TIP_SHARE
+        height = height or _cap_height(cap, down * math.tan(grazing), share)
         sigma = math.hypot(sigma, max(cap.half_m - height, height - cap.begins_m, 0.0) / _SIGMAS_95)
     intervals["height_m"] = (max(0.0, height - _SIGMAS_95 * sigma), height + _SIGMAS_95 * sigma)
     # A surface that lies wrong by one error everywhere.
@@ -855,17 +900,17 @@ def measure_object(
     return replace(measured, height_m=height, intervals=intervals, scatter_cells=spread_m / across)
 
 
-def _cap_height(cap: Cap, cell_m: float) -> float:
+def _cap_height(cap: Cap, cell_m: float, tip_share: float) -> float:
     """Return the height (m) that a cap tells, between flat and round; a cell of shadow is `cell_m` high."""
     # A flat top says by how abruptly its cap begins that half of the views err there.
     rounded = (cap.dome_m - cap.begins_m + cell_m) / (cap.top_m - cap.begins_m + cell_m)
-    tip = _TIP_SHARE * min(rounded, 1.0) * (cap.half_m - cap.top_m)
+    tip = tip_share * min(rounded, 1.0) * (cap.half_m - cap.top_m)
     return 0.5 * (cap.begins_m + cap.dome_m) + tip
 
 
 def sides_apart(sides: Sequence[SilhouetteSides]) -> float:
     """Return the share of a body's sides that opposite views see at different places (`opposed_sides`)."""
-    return opposed_share(opposed_sides(sides, _agreed_support(sides))[1])
+    return opposed_share(opposed_sides(sides, agreed_support(sides))[1])
 
 
 def _plan_intervals(

@@ -74,6 +74,8 @@ class ViewEvidence:
         Share of its segmented shadow that the object's own lies clear of; NaN where nobody compared them.
     lit : float
         Share of the object's shadow that is lit seabed in the view; NaN likewise.
+    shift_m : float
+        How far along e_c it lay from its place before it was put back, m; 0 where it stayed as told.
     """
 
     stamp_ns: int
@@ -85,6 +87,7 @@ class ViewEvidence:
     height_m: float = math.nan
     unexplained: float = math.nan
     lit: float = math.nan
+    shift_m: float = 0.0
 
 
 #: How a reason begins that doubts the image's spectrum sign, and with it whatever was carved.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry import place_text
-from .measurement import sides_apart
+from .measurement import ONE_PLAN_CELLS, sides_apart
 from .mesh import Dimensions
 from .result import OTHER_SIGN, Quality, Result
 from .volume import VoxelGrid
@@ -30,9 +30,6 @@ _UNEXPLAINED, _MOST_UNEXPLAINED = 0.1, 0.25
 #: Likewise of the shadow that it casts and that is lit in the views: 0 to 0.2 % for the same shapes.
 #: The limits are reasoned, not measured.
 _LIT, _MOST_LIT = 0.05, 0.15
-#: Sides that scatter about one plan by more than this (1σ, cross-range cells) disagree from view to view:
-#: right shapes 0.2 to 0.6, a vehicle whose views are shifted against each other 1.5 (docs/examples.md).
-_SCATTER_CELLS = 1.0
 #: Opposite views see more than this share of the sides at different places (`opposed.APART_CELLS`): another
 #: shadow touches the body's, or a part of it casts none from one side. Of 75 good results (single bodies of
 #: the development half and of ten tapering families) 7 are above it, 2 of the 3 wrong ones among them; above
@@ -223,10 +220,16 @@ def _fit_of(result: Result, reasons: list[str]) -> int:
             reasons.append(f"{100.0 * share:.0f} % {text}")
             worst = max(worst, 2 if share > most else 1)
     scatter = math.nan if result.dimensions is None else result.dimensions.scatter_cells
-    if scatter > _SCATTER_CELLS:
+    if scatter > ONE_PLAN_CELLS:
         reasons.append(
             f"the shadow's sides scatter by {scatter:.1f} cells about one plan: the views are shifted against"
             " one another, or there are several bodies"
+        )
+        worst = max(worst, 1)
+    if shifts := [one.shift_m for one in result.evidence.values() if one.shift_m]:
+        reasons.append(
+            f"the views lay {float(np.std(shifts)):.2g} m (rms) beside one another across range, and were put"
+            " together by the sides of their shadows: check the navigation"
         )
         worst = max(worst, 1)
     apart = sides_apart(result.sides) if result.dimensions is not None and result.sides else 0.0
