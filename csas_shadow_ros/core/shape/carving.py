@@ -786,11 +786,10 @@ class Carver:
         whole = self._with(body, left, left.occupied & plan.columns(self.volume) & ~body.occupied)
         faces = self._mostly_under(_FACING, body, whole.occupied & ~body.occupied)
         fit = self.misfit([whole, *others]) if unexplained >= _EXPLAINED else (math.nan, math.nan)
-        explained, more_lit = unexplained - fit[0], fit[1] - lit
+        explained = unexplained - fit[0]
         # What shines through under a slab would be lit by more than its shadows explain.
         if explained >= _EXPLAINED and (
-            (faces and unexplained > _LOST)
-            or (not faces and explained >= more_lit and self._dark_on(plan) < _DARK_TOP)
+            faces or (explained >= fit[1] - lit and self._dark_on(plan) < _DARK_TOP)
         ):
             return whole
         filled = body
@@ -798,9 +797,9 @@ class Carver:
         if np.count_nonzero(below) >= _UNDERCUT * count and self._mostly_under(_SELDOM, body, below):
             filled = self._with(body, whole, below)
         if faces and unexplained >= _EXPLAINED:
-            left, lit = self.misfit([filled, *others])
-            net = left - fit[0] - _LIT_COUNTS * (fit[1] - lit)
-            return whole if net >= _NET_EXPLAINED else filled
+            dark, lit = self.misfit([filled, *others])
+            more = dark - fit[0] - _LIT_COUNTS * (fit[1] - lit)
+            return whole if more >= _NET_EXPLAINED else filled
         return filled
 
     @staticmethod
