@@ -30,12 +30,11 @@ from .imaging.segmentation import require_silhouette
 from .parameters import PipelineParameters
 from .search.decision import Decision
 from .search.pieces import APART_CELLS, is_same_body, nothing_left, objects_of, without_neighbours
-from .shape.alignment import shifts_across
+from .shape.alignment import SCATTER_CELLS, shifts_across
 from .shape.carving import Carver, compared_shadows
 from .shape.explained import ShadowFit, mean_fit
 from .shape.hollows import EchoLook, matter_mesh, matter_of
 from .shape.measurement import (
-    ONE_PLAN_CELLS,
     SilhouetteSides,
     doubted,
     levels_of_mask,
@@ -482,7 +481,7 @@ class Reconstruction:
     def _shifts_across(self, result: Result) -> dict[int, float]:
         """Return how far each view lies beside its place, by stamp; empty where the sides bound one plan."""
         found = result.dimensions
-        if found is None or result.grid is None or not found.scatter_cells > ONE_PLAN_CELLS:
+        if found is None or result.grid is None or not found.scatter_cells > SCATTER_CELLS:
             return {}
         return shifts_across(result.sides, result.grid) if self.bodies[0].carver.keeps_masks else {}
 
