@@ -18,14 +18,14 @@ from .measurement import MIN_EDGES, PlanFit, SilhouetteSides, agreed_support
 from .volume import VoxelGrid
 
 #: Sides that scatter about one plan by more than this (1σ, cross-range cells) may be those of views that lie
-#: beside one another: edges alone scatter by 0.2 to 0.6. At half nothing more is moved, as shifts must explain
-#: most of it. At double vehicles whose views are shifted by 0.7 cells come out 0.7 to 2 cells too wide.
+#: beside one another: edges alone scatter by 0.2 to 0.6. At half nothing more is moved, as shifts must
+#: explain most of it. At double vehicles whose views are shifted by 0.7 cells come out 2 cells too wide.
 SCATTER_CELLS = 0.5
 #: Shifts and plan are told by one another so often.
 _ROUNDS = 3
-#: Shifts are believed if the sides then scatter by less than this share of what they did. On simulated
-#: vehicles whose views are shifted by 0.7 and 1.2 cells they leave 0.2 to 0.5 of it, on the measured one of
-#: docs/examples.md 0.25; where edges alone scatter, 0.7.
+#: Shifts are believed if the sides of views that show both then scatter by less than this share of what they
+#: did. Of simulated vehicles whose views are shifted by 0.7 and 1.2 cells 0.2 to 0.5 is left. Where edges
+#: alone scatter, one shift for two sides leaves 1/√2.
 _LEFT_SHARE = 0.5
 
 
@@ -53,24 +53,24 @@ def shifts_across(sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> dict[int
     right = np.array([sign for side in sides for sign in side.signs])
     cell_m = float(np.median([side.info.resolution_m[1] for side in sides]))
     shift = np.zeros(len(sides))
-    scatter = []
+    scatter_m: list[float] = []
     for _ in range(_ROUNDS + 1):
-        fit = PlanFit(sides, grid, told - right * shift[view])
+        used = shift
+        fit = PlanFit(sides, grid, told - right * used[view])
         fit.solve()
-        scatter.append(fit.spread_m)
-        if fit.count < MIN_EDGES or scatter[0] <= SCATTER_CELLS * cell_m:
+        if fit.spread_m <= SCATTER_CELLS * cell_m and not scatter_m:
             return {}
-        counts = np.zeros(len(told), np.bool_)
-        counts[fit.kept] = fit.counts
-        beyond = np.zeros(len(told))
-        beyond[fit.kept] = fit.beyond_m
-        found = np.bincount(view[counts], minlength=len(sides))
-        total = np.bincount(view[counts], (right * beyond)[counts], minlength=len(sides))
-        applied = shift.copy()
-        shift += total / np.maximum(found, 1)
-    if scatter[-1] > _LEFT_SHARE * scatter[0]:
+        counts = np.flatnonzero(fit.kept)[fit.counts]
+        beyond = np.bincount(counts, fit.beyond_m[fit.counts], minlength=len(told))
+        shown = np.bincount(view[counts], minlength=len(sides))
+        both = counts[shown[view[counts]] == 2]
+        if len(both) < MIN_EDGES:
+            return {}
+        scatter_m.append(float(np.median(np.abs(beyond[both]))))
+        shift = used + np.bincount(view, right * beyond, minlength=len(sides)) / np.maximum(shown, 1)
+    if scatter_m[-1] > _LEFT_SHARE * scatter_m[0]:
         return {}
-    return {side.info.stamp_ns: float(moved) for side, moved in zip(sides, applied, strict=True)}
+    return {side.info.stamp_ns: float(moved) for side, moved in zip(sides, used, strict=True)}
 
 
 __all__ = ["shifts_across"]
