@@ -21,6 +21,7 @@ from csas_shadow_ros.core.geometry import (
 )
 from csas_shadow_ros.core.imaging.subaperture import SubApertures
 from csas_shadow_ros.core.parameters import SubApertureParameters
+from csas_shadow_ros.core.shape.measurement import SilhouetteSides
 from csas_shadow_ros.simulation import Profile
 
 RADIUS_M, HEIGHT_M = 30.0, 12.0
@@ -232,3 +233,25 @@ def normalised_rms(a, b, where):
 
 def iou(a, b):
     return np.count_nonzero(a & b) / np.count_nonzero(a | b)
+
+
+def drawn_sides_of(infos, support, aperture_deg=12.0, keep=lambda degrees: True):
+    """Sides whose support is the mean of a known support function over the aperture."""
+    looks = np.radians(np.linspace(-aperture_deg / 2, aperture_deg / 2, 241))
+    out = []
+    for info in infos:
+        degrees = math.degrees(info.aspect_rad)
+        if not keep(degrees):
+            continue
+        phi = [info.aspect_rad - math.pi / 2, info.aspect_rad + math.pi / 2]
+        values = tuple(float(np.mean(support(p + looks))) for p in phi)
+        out.append(SilhouetteSides(info, tuple(phi), values, 1.0))
+    return out
+
+
+def box_support(length, width, heading=0.0):
+    def support(phi):
+        a = np.asarray(phi) - heading
+        return length / 2 * np.abs(np.cos(a)) + width / 2 * np.abs(np.sin(a))
+
+    return support

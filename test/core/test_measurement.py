@@ -11,6 +11,8 @@ import pytest
 from core_data import (
     HEIGHT_M,
     RADIUS_M,
+    box_support,
+    drawn_sides_of,
     ground_of_pixels,
     hidden_by_box,
     hidden_by_cylinder,
@@ -33,7 +35,6 @@ from csas_shadow_ros.core.shape.layover import echo_zone, opaque_part
 from csas_shadow_ros.core.shape.measurement import (
     SHAPES,
     PlanFit,
-    SilhouetteSides,
     cap_of,
     levels_of_mask,
     measure_object,
@@ -55,6 +56,7 @@ ONE_LOOK = tuple(
 BOX = partial(hidden_by_box, low=(-0.25, -0.12, 0.0), high=(0.15, 0.18, 0.25))
 DRUM = partial(hidden_by_cylinder, centre=(0.1, -0.05), radius_m=0.3, height_m=0.3)
 VOLUME = Volume.around((0.0, 0.0), (1.0, 1.0, 0.45), 0.02)
+drawn_sides = partial(drawn_sides_of, INFOS)
 
 
 def grid_of(occupied, volume=VOLUME):
@@ -68,33 +70,11 @@ def sides_of(hidden, infos=INFOS, target=(0.0, 0.0)):
     return [silhouette_sides(levels_of_mask(v), v, target) for v in views]
 
 
-def drawn_sides(support, aperture_deg=12.0, keep=lambda degrees: True):
-    """Sides whose support is the mean of a known support function over the aperture."""
-    looks = np.radians(np.linspace(-aperture_deg / 2, aperture_deg / 2, 241))
-    out = []
-    for info in INFOS:
-        degrees = math.degrees(info.aspect_rad)
-        if not keep(degrees):
-            continue
-        phi = [info.aspect_rad - math.pi / 2, info.aspect_rad + math.pi / 2]
-        values = tuple(float(np.mean(support(p + looks))) for p in phi)
-        out.append(SilhouetteSides(info, tuple(phi), values, 1.0))
-    return out
-
-
 def widths(fit):
     """Extent of a fitted plan along x and along y."""
     h = fit.solve()
     quarter = len(h) // 4
     return h[0] + h[2 * quarter], h[quarter] + h[3 * quarter]
-
-
-def box_support(length, width, heading=0.0):
-    def support(phi):
-        a = np.asarray(phi) - heading
-        return length / 2 * np.abs(np.cos(a)) + width / 2 * np.abs(np.sin(a))
-
-    return support
 
 
 @pytest.mark.parametrize(

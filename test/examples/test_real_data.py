@@ -97,11 +97,21 @@ def test_the_bag_gives_back_every_chip_and_its_geometry(chips, chip_bag):
         assert float(wrap_angle(a.info.aspect_rad - b.info.aspect_rad)) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_hull_comes_out_within_20_percent(vehicle):
-    body = t72_shadows.Shape.of(vehicle.grid).body
-    measured = body.length_m, body.width_m, body.height_m
-    assert measured == pytest.approx(t72_shadows.TRUE_M, rel=0.2)
+def test_the_hull_comes_out_within_10_percent_and_within_the_intervals(vehicle):
+    found = vehicle.dimensions
+    measured = found.length_m, found.width_m, found.height_m
+    assert measured == pytest.approx(t72_shadows.TRUE_M, rel=0.1)
+    for name, true in zip(("length_m", "width_m", "height_m"), t72_shadows.TRUE_M, strict=True):
+        low, high = found.intervals[name]
+        assert low < true < high
     assert vehicle.mesh.is_watertight
+
+
+def test_chips_that_were_cut_out_one_by_one_are_put_together(vehicle):
+    shifts = np.array([one.shift_m for one in vehicle.evidence.values()])
+    assert 0.2 < float(np.std(shifts)) < 0.6
+    assert vehicle.dimensions.scatter_cells < 0.6
+    assert vehicle.quality.verdict == "limited"
 
 
 def test_the_reconstruction_casts_the_shadows_that_were_measured(vehicle, chips):

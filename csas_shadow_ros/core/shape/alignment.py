@@ -5,7 +5,8 @@ shifted alike: it misses the plan that all views bound by as much on the right a
 Its width stays right. Carving keeps what nearly all views keep, and so takes from such a body twice what its
 views scatter by.
 
-A shift down-range cannot be told from another height, and stays.
+A shift down-range cannot be told from another height, and stays. So does a view that lies more than three
+cells beside its place: its sides count as those of another body.
 """
 
 from __future__ import annotations
