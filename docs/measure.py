@@ -24,6 +24,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ import scipy.ndimage
 import trimesh
 from numpy.typing import NDArray
 
-from csas_shadow_ros.core import reference
+from csas_shadow_ros.core import reconstruction, reference
 from csas_shadow_ros.core.geometry import ShadowCamera, Track, View, ViewInfo
 from csas_shadow_ros.core.imaging import likelihood, segmentation
 from csas_shadow_ros.core.imaging.enhancement import enhance, focus_range
@@ -39,6 +40,7 @@ from csas_shadow_ros.core.imaging.likelihood import Levels, box_mean
 from csas_shadow_ros.core.imaging.local_means import LocalMeans
 from csas_shadow_ros.core.imaging.mask_codes import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from csas_shadow_ros.core.imaging.subaperture import Spectrum, SubApertures
+from csas_shadow_ros.core.later_stages import run_views
 from csas_shadow_ros.core.parameters import (
     CarvingParameters,
     PipelineParameters,
@@ -487,7 +489,7 @@ MEASURES: dict[str, dict[str, Any]] = {
     "default": {},
     "  each view alone": {"agreed_support": _own_support},
     "  the sides beside alone": {"_ALL_SIDES": 0.0},
-    "  no foot": {"_FLARE_PX": math.inf},
+    "  no foot": {"_FLARE_CELLS": math.inf},
     "  no upright walls": {"_MOST": 1.0},
     "  every top flat": {"_MOST": 1.0, "_DOME_SLACK": (1.0, 1.0 + 1e-9)},
 }
@@ -537,6 +539,52 @@ def sizes(names: tuple[str, ...]) -> None:
             )
 
 
+def _misplaced(views: list[View], cells: float) -> list[View]:
+    """Return views of which each lies beside its place, down-range and across, by so many cells (1σ)."""
+    rng, out = np.random.default_rng(SEED), []
+    for view in views:
+        camera, cell_px = view.info.camera, view.info.cell_px
+        to_pixel = camera.ground_to_pixel.copy()
+        to_pixel[:2, 2] += rng.normal(0.0, cells, 2) * cell_px[::-1]
+        moved = ShadowCamera.from_ground(to_pixel, camera.sonar_m, *camera.shape)
+        out.append(replace(view, info=replace(view.info, camera=moved)))
+    return out
+
+
+def _take_shadow(views: list[View], view: ProcessedView) -> None:
+    views.append(view.require("shadow"))
+
+
+def misplaced(names: tuple[str, ...]) -> None:
+    """Print shapes of views that lie beside one another, as they are and put together across range."""
+    print(f"{'IoU with the hull, L, W, H in m':36}" + "".join(f"{name:>28}" for name in names))
+    told: dict[str, list[str]] = {}
+    for name in names:
+        made = simulate("standard", name, seed=SEED)
+        parameters = PipelineParameters(sub_aperture=SubApertureParameters(step_deg=3.0))
+        views: list[View] = []
+        take = partial(_take_shadow, views)
+        found = run(made.image, made.track, parameters, max_objects=1, on_view=take)
+        hull = partial(shadow_hull, made.truth.target, made.truth.sonar_m[::6])
+        results = {"as they are": found}
+        for cells in (0.7, 1.2):
+            moved = _misplaced(views, cells)
+            again = partial(run_views, partial(list, moved), "shadow", parameters, decision=found.decision)
+            with patched(reconstruction, shifts_across=lambda *_: {}):
+                results[f"beside by {cells} cells"] = again()
+            results[f"beside by {cells} cells, put together"] = again()
+        for label, result in results.items():
+            d, grid = result.dimensions, result.grid
+            if d is None or grid is None:
+                told.setdefault(label, []).append("no object")
+                continue
+            share = iou(grid.occupied, hull(grid.volume))
+            text = f"{share:.2f}  {d.length_m:.2f} {d.width_m:.2f} {d.height_m:.2f}"
+            told.setdefault(label, []).append(text)
+    for label, texts in told.items():
+        print(f"{label:36}" + "".join(f"{text:>28}" for text in texts))
+
+
 def _largest(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
     labels, count = scipy.ndimage.label(dark, np.ones((3, 3, 3), bool))
     if not count:
@@ -549,7 +597,9 @@ def _largest(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def main(argv: list[str] | None = None) -> int:
     """Run one of the measurements."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("what", choices=("fast", "search", "carve", "weak", "hollows", "sizes", "wrong"))
+    parser.add_argument(
+        "what", choices=("fast", "search", "carve", "weak", "hollows", "sizes", "wrong", "misplaced")
+    )
     parser.add_argument("target", nargs="*", help="for all but fast (default: all)")
     options = parser.parse_args(argv)
     if options.what == "fast":
@@ -564,6 +614,8 @@ def main(argv: list[str] | None = None) -> int:
         sizes(tuple(options.target) or TARGETS)
     elif options.what == "wrong":
         wrong(tuple(options.target) or TARGETS)
+    elif options.what == "misplaced":
+        misplaced(tuple(options.target) or ("box", "cone", "rock", "frame", "l_shape"))
     else:
         carve(tuple(options.target) or TARGETS)
     return 0
