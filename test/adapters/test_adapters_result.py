@@ -93,6 +93,7 @@ def evidence_of(n):
             9.0 + i,
             bool(i % 2),
             0.41,
+            shift_m=-0.02 * THIRD * i,
         )
         for i in range(n)
     }
