@@ -173,12 +173,6 @@ def silhouette(mesh: trimesh.Trimesh, camera: ShadowCamera) -> NDArray[np.bool_]
     return drawn.astype(bool)
 
 
-def _in_place(result: Result, info: ViewInfo) -> ViewInfo:
-    """Return the geometry of a view that was put back across range, chips being cut out one by one."""
-    told = result.evidence.get(info.stamp_ns)
-    return info if told is None else info.moved_back(told.shift_m)
-
-
 def agreement(result: Result, views: list[View]) -> NDArray[np.float64]:
     """Compare the reconstruction's shadow with each view's.
 
@@ -195,7 +189,7 @@ def agreement(result: Result, views: list[View]) -> NDArray[np.float64]:
         mask = ProcessedView(result.target, PipelineParameters(), shadow=view).require("mask").pixels
         if not (mask == 255).any():
             continue
-        drawn = silhouette(result.mesh, _in_place(result, view.info).camera)
+        drawn = silhouette(result.mesh, view.info.camera)
         rows.append([drawn[mask == 255].mean(), (mask[drawn] == 0).mean()])
     return np.array(rows)
 
@@ -302,7 +296,7 @@ def draw_views(path: Path, result: Result, views: list[View], aspects_deg: tuple
         view = min(
             views, key=lambda v: abs(math.remainder(v.info.aspect_rad - math.radians(aspect), 2 * math.pi))
         )
-        outline = silhouette(result.mesh, _in_place(result, view.info).camera)
+        outline = silhouette(result.mesh, view.info.camera)
         for row in range(2):
             panel = axes[row, column]
             panel.imshow(np.sqrt(view.pixels), cmap="gray", vmin=0, vmax=0.6)
