@@ -97,7 +97,13 @@ def test_the_bag_gives_back_every_chip_and_its_geometry(chips, chip_bag):
         assert float(wrap_angle(a.info.aspect_rad - b.info.aspect_rad)) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_hull_comes_out_within_10_percent_and_within_the_intervals(vehicle):
+def test_the_hull_comes_out_within_20_percent(vehicle):
+    body = t72_shadows.Shape.of(vehicle.grid).body
+    measured = body.length_m, body.width_m, body.height_m
+    assert measured == pytest.approx(t72_shadows.TRUE_M, rel=0.2)
+
+
+def test_the_dimensions_are_the_hull_s_within_10_percent_and_within_the_intervals(vehicle):
     found = vehicle.dimensions
     measured = found.length_m, found.width_m, found.height_m
     assert measured == pytest.approx(t72_shadows.TRUE_M, rel=0.1)
@@ -125,7 +131,7 @@ def test_the_reconstruction_casts_the_shadows_that_were_measured(vehicle, chips)
     inside_turned, lit_turned = np.median(
         t72_shadows.agreement(dataclasses.replace(vehicle, mesh=turned), chips[::8]), axis=0
     )
-    assert inside_turned - lit_turned < inside - lit
+    assert inside_turned < inside
     assert lit_turned > 3.0 * lit
 
 

@@ -66,7 +66,7 @@ _NET_EXPLAINED = 0.012
 #: docs/examples.md, whose gun widens its plan, 0.5 to 0.6 (2.2 m too long with it); three bodies of the
 #: development half that gain 0.2 to 0.3 of IoU by it 0.25 and less. At half one of these stays lost, at
 #: double the vehicle is too long.
-_MOST_LIT = 1.0 / 3.0
+_LIT_OF_EXPLAINED = 1.0 / 3.0
 #: And less than this share of its views contradicts most of what comes back: a face is lit from half of the
 #: circle at most, the seabed between bodies from nearly all of it. Of bodies of the development half 0.04 to
 #: 0.31 do so; of a frame in its laying grid 0.55, where a slab of the grid's size would explain all shadows.
@@ -802,7 +802,7 @@ class Carver:
         if faces and unexplained >= _EXPLAINED:
             dark, lit = self.misfit([filled, *others])
             more, more_lit = dark - fit[0], fit[1] - lit
-            net = more - more_lit >= _NET_EXPLAINED and more_lit <= _MOST_LIT * more
+            net = more - more_lit >= _NET_EXPLAINED and more_lit <= _LIT_OF_EXPLAINED * more
             return whole if net else filled
         return filled
 

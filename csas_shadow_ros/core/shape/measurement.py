@@ -97,11 +97,11 @@ _FOREIGN_CELLS = 3.0
 MIN_EDGES = 24
 #: Sides that scatter about the fitted plan by more than this (cross-range cells, 1σ) are not those of one
 #: plan: edges are found to a fraction of a cell. Simulated targets scatter by 0.19 to 0.57, the chips of a
-#: measured vehicle, which were cut out one by one (docs/examples.md), by 1.5.
+#: measured vehicle, which were cut out one by one (docs/examples.md), by 1.65 before they are put together.
 ONE_PLAN_CELLS = 1.0
 #: Parts of a plan that are thinner than this are not measured where the sides scatter so (cross-range cells).
-#: The measured vehicle of docs/examples.md is 7.74 m long with its crumbs and 6.96 m without (its hull has
-#: 6.95 m); at half 7.02 m, at double 6.76 m.
+#: The measured vehicle of docs/examples.md, before its chips are put together, is 7.74 m long with its crumbs
+#: and 6.96 m without (its hull has 6.95 m); at half 7.02 m, at double 6.76 m.
 _THIN_CELLS = 2.0
 #: Resamplings of the views.
 _RESAMPLINGS = 20

@@ -54,7 +54,7 @@ def opposed_sides(sides: Sequence[SilhouetteSides], support_m: FloatArray) -> tu
     if not sides:
         return directions, apart
     phi = np.array([angle for side in sides for angle in side.direction_rad])
-    right = np.array([math.sin(a - side.info.aspect_rad) > 0 for side in sides for a in side.direction_rad])
+    right = np.array([sign > 0 for side in sides for sign in side.signs])
     within = _WITHIN * np.array([side.info.aperture_rad for side in sides for _ in side.direction_rad])
     cell_m = float(np.median([side.info.resolution_m[1] for side in sides]))
     for n, direction in enumerate(directions):
