@@ -85,7 +85,7 @@ def reconstruct(
     >>> result = csas.reconstruct(run, csas.parameters(step_deg=5))
     >>> result
     Result: object, quality limited
-      the shadow leaves the image in ... of 72 views, expected a larger image
+      the shadow leaves the image in ... of 72 views, expected an image of at least ... m
       0... × 0... × 0... m, 0... m³, heading ...°, at x ..., y ... m
       72 views used, 0 refused, 360° of the circle
     >>> result.mesh.is_watertight

@@ -253,7 +253,7 @@ class CarvingParameters(Parameters):
         high=1.0,
     )
     min_views_fraction: float = bounded(
-        0.25,
+        0.5,
         "call a voxel unknown if fewer of the views see it (consensus: object only if it stands on some)",
         low=0.0,
         high=1.0,

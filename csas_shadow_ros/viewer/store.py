@@ -21,6 +21,7 @@ from msg_adapters.camera_info import GroundInfo
 
 from ..core.errors import CsasError
 from ..core.geometry import Track, ViewInfo
+from ..core.parameters import CarvingParameters
 from ..core.shape.mesh import Dimensions
 from ..core.shape.threshold import needed_threshold, well_seen_voxels
 from ..core.shape.volume import VoxelGrid
@@ -235,8 +236,10 @@ class ViewStore:
             }
             self.put_part("pictures", self._parts["pictures"] | {name: about})
 
-    def put_grid(self, name: str, grid: VoxelGrid, min_views_fraction: float = 0.25) -> None:
+    def put_grid(self, name: str, grid: VoxelGrid, min_views_fraction: float | None = None) -> None:
         """Set a volume: ``main`` (what was carved) or ``other`` (the other kind of method)."""
+        if min_views_fraction is None:
+            min_views_fraction = CarvingParameters().min_views_fraction
         well_seen = well_seen_voxels(grid.views, grid.method, min_views_fraction)
         needed = needed_threshold(grid.likelihood, grid.method, well_seen)
         data = volume_codes(needed).tobytes()

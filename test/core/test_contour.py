@@ -69,6 +69,34 @@ def test_views_that_disagree_tell_no_height():
     assert contour_height([], (0.0, 0.0), 2.0) is None
 
 
+def ring(info, rim=0.45, height=0.3):
+    """The shadow of a far rim, seen through the hole: it begins where that of the near rim ends."""
+    across = np.arange(-rim / 2.0, rim / 2.0, 0.012)
+    origin = math.hypot(*info.camera.sonar_m[:2])
+    sonar_z = info.camera.sonar_m[2]
+    far = np.sqrt(rim**2 - across**2)
+    end = (origin + far) * sonar_z / (sonar_z - height) - origin
+    return Contour(*(tuple(map(float, a)) for a in (across, 0.1 - far, end)))
+
+
+def dark_top(info, half=0.3, height=0.2):
+    """A flat top as dark as its shadow, which seems to begin at the near side."""
+    told = flat_top(info, height, half)
+    return replace(told, begin_m=tuple(begin - 2.0 * half for begin in told.begin_m))
+
+
+@pytest.mark.parametrize("shape", [ring, dark_top])
+def test_a_contour_before_the_middle_all_round_the_circle_tells_no_height(shape):
+    """A tyre of 0.38 m came out 0.50 ± 0.02 m high, a drum of 0.15 m with a dark top 0.20 ± 0.01 m."""
+    assert contour_height([(info, shape(info)) for info in INFOS], (0.0, 0.0), 2.0) is None
+
+
+def test_a_plan_that_lies_off_the_middle_it_is_told_by_still_tells_its_height():
+    told = contour_height([(info, flat_top(info)) for info in INFOS], (0.05, -0.05), 2.0)
+    assert told is not None
+    assert told.height_m == pytest.approx(0.2, abs=0.01)
+
+
 def test_no_height_is_told_above_what_the_shadows_leave():
     told = contour_height([(info, flat_top(info)) for info in INFOS], (0.0, 0.0), 0.19)
     assert told is not None

@@ -43,6 +43,10 @@ _LEAST_CELLS = 2.0
 #: The views tell a height if this share of them tells the same, to a cell or `_SAME`. Of the shapes above,
 #: those that agree so are right to 1.8 tan ψ cells; below 0.9 some are wrong by 20.
 _AGREE, _SAME = 0.9, 0.05
+#: No contour lies before the middle of its plan all round the circle: shadow that begins there shows through
+#: a hole, or covers a dark top, and its length tells too much. More than so many resolution cells
+#: down-range before it, in the median of the views, tell no height.
+_BEFORE_CELLS = 0.5
 #: A top is round if its contour drops from its middle to its sides by more than this share of what a sphere
 #: with a contour there does. Of the shapes above flat tops drop by -0.1 to 0.5, spheres by 2.6 to 3.2 (their
 #: near end, and so their contour, is told too far behind). At half a box is taken for round and comes out too
@@ -186,7 +190,10 @@ def contour_height(
     if float(same.mean()) < _AGREE:
         return None
     grazing = float(np.median([info.camera.grazing_rad for info, _ in contours]))
-    radius = max(float(np.median(behind)), 0.0)
+    middle = float(np.median(behind))
+    if middle < -_BEFORE_CELLS * float(np.median([info.resolution_m[0] for info, _ in contours])):
+        return None
+    radius = max(middle, 0.0)
     added = radius * math.tan(grazing / 2.0)
     round_top = False if added <= cell / 2.0 else _is_round(profiles, radius, grazing, cell)
     share, unsure = {False: (0.0, 0.0), True: (1.0, _ROUND_SIGMA), None: (0.5, 0.5)}[round_top]

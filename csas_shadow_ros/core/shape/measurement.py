@@ -95,6 +95,9 @@ _VOXEL_WEIGHT, _VOXEL_ALONE = 0.1, 1.0
 _FOREIGN_CELLS = 3.0
 #: Fewer edges than this give no plan: the voxels alone are measured then.
 MIN_EDGES = 24
+#: Fewer views than this whose shadow ends in the image tell no height (looks): one or two may be
+#: bad silhouettes. Reasoned; what half and double of it change is not measured.
+LEAST_ENDS = 3
 #: Sides that scatter about the fitted plan by more than this (cross-range cells, 1σ) are not those of one
 #: plan: edges are found to a fraction of a cell. Simulated targets scatter by 0.19 to 0.57, the chips of a
 #: measured vehicle, which were cut out one by one (docs/examples.md), by 1.65 before they are put together.
@@ -836,6 +839,7 @@ def measure_object(
         their ends if the views agree on one, otherwise from the carved layers; volume of the surface.
         Intervals of length and width come from resampling the views in blocks of an aperture (neighbours
         share their looks), with the error of an edge (0.8 of a cross-range cell) added in quadrature.
+        Height and volume have none where the shadows of all but two views leave the image.
 
     Notes
     -----
@@ -893,10 +897,11 @@ def measure_object(
         share = 0.0 if any(side.shift_m for side in sides) else _TIP_SHARE
         height = height or _cap_height(cap, down * math.tan(grazing), share)
         sigma = math.hypot(sigma, max(cap.half_m - height, height - cap.begins_m, 0.0) / _SIGMAS_95)
-    intervals["height_m"] = (max(0.0, height - _SIGMAS_95 * sigma), height + _SIGMAS_95 * sigma)
-    # A surface that lies wrong by one error everywhere.
-    change = float(mesh.area) * math.hypot(edge / 2.0, d / 4.0)
-    intervals["volume_m3"] = (max(0.0, whole.volume_m3 - change), whole.volume_m3 + change)
+    if sum(not side.cut for side in sides) >= LEAST_ENDS:
+        intervals["height_m"] = (max(0.0, height - _SIGMAS_95 * sigma), height + _SIGMAS_95 * sigma)
+        # A surface that lies wrong by one error everywhere.
+        change = float(mesh.area) * math.hypot(edge / 2.0, d / 4.0)
+        intervals["volume_m3"] = (max(0.0, whole.volume_m3 - change), whole.volume_m3 + change)
     return replace(measured, height_m=height, intervals=intervals, scatter_cells=spread_m / across)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry import place_text
-from .measurement import ONE_PLAN_CELLS, sides_apart
+from .measurement import LEAST_ENDS, ONE_PLAN_CELLS, sides_apart
 from .mesh import Dimensions
 from .result import OTHER_SIGN, Quality, Result
 from .volume import VoxelGrid
@@ -39,10 +39,6 @@ _MOST_APART = 0.1
 #: that see a tip. Those alone bound the top, so that a quarter of the circle without tips changes no height
 #: (the benchmark's frame, 28 %); with none the top is unknown.
 _MOST_CUT = 0.5
-#: So many views (looks) at least, whose shadow ends in the image, contradict a height: one may be a bad
-#: silhouette. Reasoned; what half and double of it change is not measured. No one of 20 scenes of the
-#: population's development half, which it was not chosen on, has the reason.
-_LEAST_ENDS = 3
 #: So many sides `cut_sides` looks at: the bottom is the seabed.
 _ALL_SIDES = 5
 
@@ -59,8 +55,11 @@ def judge(result: Result) -> None:
     worst = _decide(result, reasons)
     cut, told = sum(side.cut for side in result.sides), len(result.sides)
     if told and cut > _MOST_CUT * told:
-        reasons.append(f"the shadow leaves the image in {cut} of {told} views; expected a larger image")
-        worst = max(worst, 1)
+        nothing = ": none tells the height" if told - cut < LEAST_ENDS else ""
+        reasons.append(
+            f"the shadow leaves the image in {cut} of {told} views{nothing}; expected {_needed_image(result)}"
+        )
+        worst = max(worst, 2 if nothing else 1)
         if result.verdict == "no object":
             result.verdict, worst = "undecided", 2
     if result.mesh is not None and result.grid is not None:
@@ -78,6 +77,19 @@ def judge(result: Result) -> None:
     # Semicolons separate reasons where they travel as one text: none may hold one.
     told_reasons = tuple(reason.replace(";", ",") for reason in reasons)
     result.quality = Quality(("good", "limited", "not trustworthy")[worst], told_reasons)
+
+
+def _needed_image(result: Result) -> str:
+    """Return what image would hold the shadows, if the object is as high as carving lets it be."""
+    found = result.dimensions
+    if found is None:
+        return "a larger image"
+    top = float(np.nanmax([found.height_m, found.hull_top_m]))
+    sonars = np.array([side.info.camera.sonar_m for side in result.sides])
+    place = np.asarray(found.position_m)
+    behind = top * np.hypot(*(sonars[:, :2] - place).T) / np.maximum(sonars[:, 2] - top, top)
+    half = float(np.hypot(*place)) + math.hypot(found.length_m, found.width_m) / 2.0 + float(behind.max())
+    return f"an image of at least {2.0 * half:.1f} m"
 
 
 def _decide(result: Result, reasons: list[str]) -> int:
@@ -239,29 +251,7 @@ def _fit_of(result: Result, reasons: list[str]) -> int:
             " touches its own, or a part of it casts none from one side"
         )
         worst = max(worst, 1)
-    if text := _too_high(result):
-        reasons.append(text)
-        worst = 2
     return worst
-
-
-def _too_high(result: Result) -> str:
-    """Say that no shadow ends as far out as the height requires; empty if one does, or too few end."""
-    if result.dimensions is None or "height_m" not in result.dimensions.intervals:
-        return ""
-    ends = [
-        result.evidence[side.info.stamp_ns].height_m
-        for side in result.sides
-        if not side.cut and side.info.stamp_ns in result.evidence
-    ]
-    ends = [height for height in ends if math.isfinite(height)]
-    least = result.dimensions.intervals["height_m"][0]
-    if len(ends) < _LEAST_ENDS or max(ends) >= least:
-        return ""
-    return (
-        f"no shadow reaches as far as the height says: the longest tells {max(ends):.2f} m, and the interval"
-        f" begins at {least:.2f} m"
-    )
 
 
 def explained_share(result: Result) -> float | None:
