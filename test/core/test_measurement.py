@@ -558,6 +558,16 @@ def test_a_side_that_is_drawn_in_upwards_is_followed_to_its_foot_that_the_echo_h
     assert np.median(support) == pytest.approx(0.3, abs=0.012)  # a pixel; the foot hides 2.4 cm
 
 
+@pytest.mark.parametrize("radius_m", [0.02, 0.04, 0.06, 0.1])
+def test_a_shadow_narrower_than_an_edge_s_profile_has_its_own_width(radius_m):
+    """What is lit behind the other edge took from it: a pole of 4 cm had its sides 8 cm inside its middle."""
+    pole = partial(hidden_by_cylinder, centre=(0.0, 0.0), radius_m=radius_m, height_m=0.4)
+    sides = sides_of(pole, INFOS[::6])
+    assert INFOS[0].resolution_m[1] > 0.06
+    # Half a pixel: what a drawn silhouette is sure to.
+    assert [np.mean(side.support_m) for side in sides] == pytest.approx([radius_m] * len(sides), abs=0.0065)
+
+
 def hidden_by_flared(x, y, sonar):
     """A wall with a foot that stands out by 3 cm to either side and is 9 cm high."""
     wall = hidden_by_box(x, y, sonar, (-0.15, -0.15, 0.0), (0.15, 0.15, 0.35))

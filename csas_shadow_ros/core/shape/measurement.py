@@ -253,8 +253,10 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
     e_c = cross_range_axis(info.aspect_rad)
     directions, supports, shapes, echoes = [], [], [], []
     reach_px = echo_reach_px(levels, mask, shadow, (u0, v0))
+    middle = (first + last) / 2.0
     for sign, edge in ((1, last), (-1, first)):
-        found = _side(levels, rows, sign * (edge - u0) * scale, scale, sign, (u0, v0), info.cell_px)
+        out_px, inner_px = (sign * (column - u0) * scale for column in (edge, middle))
+        found = _side(levels, rows, out_px, inner_px, scale, sign, (u0, v0), info.cell_px)
         if found is None:
             continue
         out, shape = found
@@ -295,6 +297,7 @@ def _side(
     levels: Levels,
     rows: NDArray[np.intp],
     out_px: FloatArray,
+    inner_px: FloatArray,
     scale: FloatArray,
     sign: int,
     target_px: tuple[float, float],
@@ -306,11 +309,12 @@ def _side(
     """
     # By a running median: choosing rows by their own edges would favour those that err outwards.
     down_px, across_px = cell_px
-    calm = scipy.ndimage.median_filter(out_px, 2 * round(_MEDIAN_HALF_CELLS * down_px) + 1, mode="nearest")
+    size = 2 * round(_MEDIAN_HALF_CELLS * down_px) + 1
+    calm, inner_px = (scipy.ndimage.median_filter(px, size, mode="nearest") for px in (out_px, inner_px))
     kept = np.abs(calm - np.percentile(calm, 90)) <= _SIDE_CELLS * across_px
     if kept.sum() < _LEAST_CELLS * down_px:
         return None
-    rows, out_px, scale = rows[kept], out_px[kept], scale[kept]
+    rows, out_px, inner_px, scale = rows[kept], out_px[kept], inner_px[kept], scale[kept]
     u0, v0 = target_px
     curves, shape, slope = _fitted_side(rows - rows.mean(), out_px, across_px)
     # The target's echo hides the foot of a side that is drawn in upwards: its shadow would begin at the
@@ -319,11 +323,13 @@ def _side(
     out = dict.fromkeys(SHAPES, math.nan)
     for name, curve in curves.items():
         foot = max(0.0, -slope) * hidden if name == "tapering" else 0.0
-        beyond = _edge_beyond(levels, rows, scale, sign * curve, sign, u0, across_px)
+        beyond = _edge_beyond(levels, rows, scale, sign * curve, inner_px, sign, u0, across_px)
         out[name] = float(curve.max()) + foot + beyond
     near = rows < rows[0] + _FOOT_CELLS * down_px
     foot_px = np.full(int(near.sum()), float(calm[kept][near].mean()))
-    beyond_foot = _edge_beyond(levels, rows[near], scale[near], sign * foot_px, sign, u0, across_px)
+    beyond_foot = _edge_beyond(
+        levels, rows[near], scale[near], sign * foot_px, inner_px[near], sign, u0, across_px
+    )
     out["flared"] = float(foot_px[0]) + beyond_foot
     return None if math.isnan(out[shape]) else (out, shape)
 
@@ -333,13 +339,16 @@ def _edge_beyond(
     rows: NDArray[np.intp],
     scale: FloatArray,
     curve: FloatArray,
+    inner_px: FloatArray,
     sign: int,
     u0: float,
     cell_px: float,
 ) -> float:
     """Return how far outside of a fitted side (columns from u0, at the target's range) its edge lies, pixels.
 
-    From the mean profile across the edge, rows laid over one another along the side; NaN where unknown.
+    From the mean profile across the edge, rows laid over one another along the side; NaN where unknown. The
+    side has the shadow from its middle outwards, `inner_px` towards it: what lies beyond is the other side's.
+    A shadow that is narrower than the profile would lose there what is lit behind the other edge.
     """
     half = max(1, round(_PROFILE_CELLS * cell_px))
     steps = sign * np.arange(-half, half + 1)
@@ -350,8 +359,10 @@ def _edge_beyond(
     known = levels.known[rows[:, None], columns] & inside
     if not known.any(axis=0).all():
         return math.nan
-    power = np.where(known, levels.power[rows[:, None], columns], 0.0).sum(axis=0) / known.sum(axis=0)
     shadow_power = 1.0 / levels.contrast**2
+    own = sign * (columns - u0) * scale[:, None] >= inner_px[:, None]
+    powers = np.where(own, levels.power[rows[:, None], columns], shadow_power)
+    power = np.where(known, powers, 0.0).sum(axis=0) / known.sum(axis=0)
     dark = np.clip((1.0 - power) / (1.0 - shadow_power), -0.5, 1.2)
     return -half - 0.5 + float(dark.sum()) + float((offsets - sign * steps).mean())
 
