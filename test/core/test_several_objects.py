@@ -157,7 +157,7 @@ def test_a_low_wide_body_beside_another_is_an_object_too(height_m):
     objects = pipeline.run(run.image, run.track, p, workers=1).objects
     assert len(objects) == 2
     found = objects[1].dimensions
-    assert (found.length_m, found.width_m) == pytest.approx((1.9, 1.8), abs=0.3)
+    assert (found.length_m, found.width_m) == pytest.approx((1.9, 1.8), abs=0.325)  # 2.5 voxels
     low, high = found.intervals["height_m"]
     assert low <= height_m <= high
 

@@ -35,6 +35,7 @@ from ..threads import in_order
 from .explained import ShadowFit, count_shadow_pixels, mean_fit, shadow_fit, unexplained_shadow
 from .layover import echo_zone, opaque_part
 from .plan import StandingPlan, plan_of_sides, shadow_sides
+from .rings import without_rings
 from .seabed import SeabedSlope, seabed_slope, shadow_end
 from .threshold import LEAST_VOXELS, least_threshold, least_views_fraction, thresholded
 from .volume import MARGIN_SHARE, Target, Volume, VoxelGrid
@@ -756,10 +757,7 @@ class Carver:
     def given_back(self, body: VoxelGrid, others: Sequence[VoxelGrid] = ()) -> VoxelGrid:
         """Give back to a body what only lit pixels on its own plan took from it, where these speak for that.
 
-        They may be seabed, seen in a hollow or under an overhang, or the echo of a side that slopes down to
-        the seabed, or speckle on a top. Two signs tell that they are echo: with what they took, the body
-        explains shadow that it leaves unexplained without; or they took much from under it, and few views
-        contradict that.
+        Then the ground that it encloses is filled where its own shadow is not seen on it (`rings`).
 
         Parameters
         ----------
@@ -773,9 +771,30 @@ class Carver:
         VoxelGrid
             `body` itself where nothing is given back.
         """
-        count = int(np.count_nonzero(body.occupied))
-        if not count or not self._masks:
+        if not body.occupied.any() or not self._masks:
             return body
+        told = self._on_own_plan(body, others)
+        slope = told.seabed
+        infos = (kept.info if slope is None else slope.corrected(kept.info) for kept in self._masks.values())
+        views = in_order(KeptMask.view, self._masks.values(), _LOOKERS)
+        occupied = without_rings(
+            told, (replace(view, info=info) for (_, view), info in zip(views, infos, strict=True))
+        )
+        if occupied is told.occupied:
+            return told
+        # What is lit there is the body's own top: no view contradicts.
+        free = np.where(occupied & ~told.occupied, np.float32(0.0), told.likelihood)
+        return replace(thresholded(self.volume, free, told.views, self.parameters), seabed=slope)
+
+    def _on_own_plan(self, body: VoxelGrid, others: Sequence[VoxelGrid]) -> VoxelGrid:
+        """Give back what lit pixels on the body's own plan took, where they speak for its own echo.
+
+        They may be seabed, seen in a hollow or under an overhang, or the echo of a side that slopes down to
+        the seabed, or speckle on a top. Two signs tell that they are echo: with what they took, the body
+        explains shadow that it leaves unexplained without; or they took much from under it, and few views
+        contradict that.
+        """
+        count = int(np.count_nonzero(body.occupied))
         below = _columns_filled(body.occupied) & ~body.occupied
         undercut = np.count_nonzero(below) >= _UNDERCUT * count
         unexplained, lit = self.misfit([body, *others])
@@ -790,16 +809,20 @@ class Carver:
         faces = self._mostly_under(_FACING, body, whole.occupied & ~body.occupied)
         fit = self.misfit([whole, *others]) if unexplained >= _EXPLAINED else (math.nan, math.nan)
         explained = unexplained - fit[0]
+        stands = beside._lit_off(plan, [whole, *others]) - beside._lit_off(plan, [body, *others])
+        may_be_whole = unexplained >= _EXPLAINED and stands <= _LIT_OF_EXPLAINED * explained
         # What shines through under a slab would be lit by more than its shadows explain.
-        if explained >= _EXPLAINED and (
-            faces or (explained >= fit[1] - lit and self._dark_on(plan) < _DARK_TOP)
+        if (
+            may_be_whole
+            and explained >= _EXPLAINED
+            and (faces or (explained >= fit[1] - lit and self._dark_on(plan) < _DARK_TOP))
         ):
             return whole
         filled = body
         below = _columns_filled(body.occupied, whole.occupied) & ~body.occupied
         if np.count_nonzero(below) >= _UNDERCUT * count and self._mostly_under(_SELDOM, body, below):
             filled = self._with(body, whole, below)
-        if faces and unexplained >= _EXPLAINED:
+        if faces and may_be_whole:
             dark, lit = self.misfit([filled, *others])
             more, more_lit = dark - fit[0], fit[1] - lit
             net = more - more_lit >= _NET_EXPLAINED and more_lit <= _LIT_OF_EXPLAINED * more
@@ -868,7 +891,7 @@ class Carver:
         carver = self._in(plan.volume_round(self.volume))
         cleared = carver._clear_of(others)._clear_of_plan(plan)
         left = cleared.first_look()
-        body = replace(left, occupied=left.occupied & plan.columns(left.volume))
+        body = self._bounded(replace(left, occupied=left.occupied & plan.columns(left.volume)))
         if not body.occupied.any():
             return None
         most = sum(cleared.misfit([seen, *others])) if seen.occupied.any() else _LOST
@@ -896,6 +919,21 @@ class Carver:
                 shares.append(np.count_nonzero(dark & plan.top(view.info)) / count)
         return float(np.mean(shares)) if shares else math.nan
 
+    def _lit_off(self, plan: StandingPlan, bodies: Sequence[VoxelGrid]) -> float:
+        """Return the share of a body's shadow that is lit where nothing on its plan can echo.
+
+        Covered pixels there are seabed: what shines between the legs of a table, say.
+        """
+
+        def told(kept: KeptMask) -> KeptMask:
+            view = kept.view()
+            covered = view.pixels == MASK_COVERED
+            lit = np.where(covered, np.uint8(MASK_OUTSIDE), view.pixels)
+            return _unknown_where(KeptMask.of(replace(view, pixels=lit)), plan.echo(kept.info))
+
+        masks = {stamp: told(kept) for stamp, kept in self._masks.items()}
+        return mean_fit(compared_shadows(masks, bodies).values()).lit
+
     def _own_plan(self, body: VoxelGrid, within: Volume) -> StandingPlan | None:
         """Return the plan that the sides of a body's shadows bound within a volume, if they bound one."""
         middle = within.centre_m[:2]
@@ -907,14 +945,23 @@ class Carver:
         return StandingPlan(corners, float(body.volume.z_m[top]) + body.volume.voxel_size_m / 2.0)
 
     def _clear_of_plan(self, plan: StandingPlan) -> Carver:
-        """Carve the same masks again, lit pixels that may be the echo of what stands on a plan as unknown."""
-        return self._again(lambda kept: _unknown_where(kept, plan.echo(kept.info)))
+        """Carve the same masks again, lit pixels that may be the echo of what stands on a plan as unknown.
+
+        The plan bounds what few views know then.
+        """
+        again = self._again(lambda kept: _unknown_where(kept, plan.echo(kept.info)))
+        again.parameters = replace(self.parameters, min_views_fraction=0.0)
+        return again
 
     def _with(self, body: VoxelGrid, other: VoxelGrid, voxels: NDArray[np.bool_]) -> VoxelGrid:
         """Add some voxels of another body to one."""
         likelihood = np.where(voxels, other.likelihood, body.likelihood)
-        views = np.where(voxels, other.views, body.views)
+        views = np.where(voxels, self._bounded(other).views, body.views)
         return replace(thresholded(self.volume, likelihood, views, self.parameters), seabed=body.seabed)
+
+    def _bounded(self, body: VoxelGrid) -> VoxelGrid:
+        """Count for the voxels of a body that stands on a known plan all views, as all of these bound it."""
+        return replace(body, views=np.where(body.occupied, np.uint16(len(self.stamps)), body.views))
 
     def shadow_fits(self, grids: Sequence[VoxelGrid]) -> dict[int, ShadowFit]:
         """Compare the carving silhouettes with bodies' shadows, its own body's first, by stamp.

@@ -1,0 +1,99 @@
+"""Ground that a carved body encloses: a lit top that carved the body's middle away, or a hollow.
+
+Lit pixels inside a ring of walls may be the top of a low body, as of a slab under a table, or the floor of
+a tray. The walls themselves tell the two apart: on a floor their own shadow falls, and a top is lit there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from ..geometry import View
+from ..imaging.mask_codes import MASK_SHADOW, MASK_UNKNOWN
+from .explained import cast_shadow
+from .volume import VoxelGrid
+
+BoolArray = NDArray[np.bool_]
+
+#: The walls' shadow counts clear of its edges by so much (resolution cells), which speckle roughens.
+_CLEAR_CELLS = 1.0
+#: What is enclosed is a hollow if this share of the walls' shadow on its ground is dark.
+_HOLLOW = 0.3
+
+
+def enclosed(occupied: BoolArray) -> BoolArray:
+    """Mark the free voxels that walls enclose in each layer from the seabed up, shape (nz, ny, nx).
+
+    Examples
+    --------
+    >>> ring = np.ones((2, 3, 3), bool)
+    >>> ring[:, 1, 1] = False
+    >>> ring[1, 0, 0] = False
+    >>> enclosed(ring)[:, 1, 1].tolist()
+    [True, True]
+    >>> ring[0, 0, 1] = False
+    >>> bool(enclosed(ring).any())
+    False
+    """
+    out = np.zeros_like(occupied)
+    below = np.ones(occupied.shape[1:], np.bool_)
+    for k, layer in enumerate(occupied):
+        out[k] = below = scipy.ndimage.binary_fill_holes(layer) & ~layer & below
+        if not below.any():
+            break
+    return out
+
+
+def without_rings(body: VoxelGrid, masks: Iterable[View]) -> BoolArray:
+    """Return a body's voxels with those that its walls enclose, where their shadow is not seen in there.
+
+    Parameters
+    ----------
+    body : VoxelGrid
+        The body.
+    masks : iterable of View
+        Shadow masks.
+
+    Returns
+    -------
+    ndarray of bool, shape (nz, ny, nx)
+        The body's own array where nothing is filled.
+    """
+    free = enclosed(body.occupied)
+    labels, count = scipy.ndimage.label(free[0])
+    if not count:
+        return body.occupied
+    rows, cols = np.nonzero(labels)
+    ground = np.stack([body.volume.x_m[cols], body.volume.y_m[rows], np.ones(len(rows))])
+    ring = labels[rows, cols]
+    fallen, dark = np.zeros(count + 1), np.zeros(count + 1)
+    for mask in masks:
+        shaded, seen_dark = _shade_at(mask, body, ground)
+        fallen += np.bincount(ring, shaded, count + 1)
+        dark += np.bincount(ring, shaded & seen_dark, count + 1)
+    top = (fallen > 0.0) & (dark <= _HOLLOW * fallen)
+    return np.asarray(body.occupied | (free & top[labels])) if top.any() else body.occupied
+
+
+def _shade_at(mask: View, body: VoxelGrid, ground: NDArray[np.float64]) -> tuple[BoolArray, BoolArray]:
+    """Say of places (x, y, 1) whether the body's shadow falls there in a view, and whether they are dark."""
+    cast = cast_shadow(mask, body.volume, body.occupied).view(np.uint8)
+    down, across = (
+        math.ceil(_CLEAR_CELLS * cell / spacing)
+        for cell, spacing in zip(mask.info.resolution_m, mask.info.camera.spacing_m, strict=True)
+    )
+    clear = cv2.erode(cast, np.ones((2 * down + 1, 2 * across + 1), np.uint8)).view(np.bool_)
+    u, v = np.rint(mask.info.camera.ground_to_pixel[:2] @ ground).astype(np.intp)
+    inside = (u >= 0) & (u < clear.shape[1]) & (v >= 0) & (v < clear.shape[0])
+    u, v = np.where(inside, u, 0), np.where(inside, v, 0)
+    pixels = mask.pixels[v, u]
+    return inside & clear[v, u] & (pixels != MASK_UNKNOWN), pixels == MASK_SHADOW
+
+
+__all__ = ["enclosed", "without_rings"]
