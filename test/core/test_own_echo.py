@@ -65,6 +65,30 @@ def carved(mesh, monkeypatch):
     return grid, bare[0], hull
 
 
+def on_legs(slab):
+    """Make a table of 0.60 x 0.45 x 0.42 m, with or without a slab of 0.9 x 0.7 x 0.1 m under it."""
+    legs = [brick((0.06, 0.06, 0.35), (sx * 0.25, sy * 0.18, 0.0)) for sx in (-1, 1) for sy in (-1, 1)]
+    top = brick((0.6, 0.45, 0.08), (0.0, 0.0, 0.34))
+    return join_bodies([*legs, top, *([brick((0.9, 0.7, 0.1), (0.0, 0.0, 0.0))] if slab else [])])
+
+
+@pytest.mark.parametrize(
+    ("slab", "sizes_m", "least"),
+    [(False, (0.60, 0.45, 0.42), 0.75), (True, (0.90, 0.70, 0.42), 0.8)],
+    ids=["table", "slab under it"],
+)
+def test_a_table_is_no_block_and_a_slab_under_it_no_ring(slab, sizes_m, least):
+    """They came out at 0.29 and 0.61 of their hulls, both called good."""
+    made = simulate("standard", on_legs(slab), seed=5, heading_deg=20.0, workers=2)
+    found = run(made.image, made.track, PipelineParameters(SubApertureParameters(step_deg=6.0)))
+    hull = shadow_hull(made.truth.target, made.truth.sonar_m[::12], found.grid.volume)
+    assert iou(found.grid.occupied, hull) > least
+    for name, true_m in zip(("length_m", "width_m", "height_m"), sizes_m, strict=True):
+        low, high = found.dimensions.intervals[name]
+        assert low < true_m < high
+        assert getattr(found.dimensions, name) == pytest.approx(true_m, abs=max(0.02, 0.05 * true_m))
+
+
 @pytest.mark.parametrize("size_m", [(2.0, 1.8, 0.4), (1.6, 1.5, 0.3)])
 def test_a_low_wide_body_of_which_the_search_sees_little_is_carved_whole(size_m, monkeypatch):
     """Half as wide a volume is what all its shadows cross in."""

@@ -23,34 +23,53 @@ BoolArray = NDArray[np.bool_]
 
 #: The walls' shadow counts clear of its edges by so much (resolution cells), which speckle roughens.
 _CLEAR_CELLS = 1.0
+#: Walls have gaps, where a view or two see past them, of up to twice this (cross-range cells).
+_GAP_CELLS = 1.0
 #: What is enclosed is a hollow if this share of the walls' shadow on its ground is dark.
 _HOLLOW = 0.3
 
 
-def enclosed(occupied: BoolArray) -> BoolArray:
+def enclosed(occupied: BoolArray, gap_voxels: float = 0.0) -> BoolArray:
     """Mark the free voxels that walls enclose in each layer from the seabed up, shape (nz, ny, nx).
+
+    Parameters
+    ----------
+    occupied : ndarray of bool, shape (nz, ny, nx)
+        The body.
+    gap_voxels : float
+        Gaps in the walls up to twice this count as closed.
 
     Examples
     --------
     >>> ring = np.ones((2, 3, 3), bool)
     >>> ring[:, 1, 1] = False
-    >>> ring[1, 0, 0] = False
+    >>> ring[1, 0, 1] = False
     >>> enclosed(ring)[:, 1, 1].tolist()
+    [True, False]
+    >>> enclosed(ring, gap_voxels=1.0)[:, 1, 1].tolist()
     [True, True]
-    >>> ring[0, 0, 1] = False
-    >>> bool(enclosed(ring).any())
-    False
     """
     out = np.zeros_like(occupied)
     below = np.ones(occupied.shape[1:], np.bool_)
     for k, layer in enumerate(occupied):
-        out[k] = below = scipy.ndimage.binary_fill_holes(layer) & ~layer & below
+        out[k] = below = scipy.ndimage.binary_fill_holes(_closed(layer, gap_voxels)) & ~layer & below
         if not below.any():
             break
     return out
 
 
-def without_rings(body: VoxelGrid, masks: Iterable[View]) -> BoolArray:
+def _closed(layer: BoolArray, radius: float) -> BoolArray:
+    """Close gaps in a layer up to twice a radius, voxels."""
+    if radius <= 0.0 or not layer.any():
+        return layer
+    room = 1 + math.ceil(radius)
+    padded = np.pad(layer, room)
+    grown = scipy.ndimage.distance_transform_edt(~padded) <= radius
+    closed = scipy.ndimage.distance_transform_edt(grown) > radius
+    return np.asarray(layer | closed[room:-room, room:-room])
+
+
+def without_rings(body: VoxelGrid, masks: Iterable[View], cell_m: float) -> BoolArray:
     """Return a body's voxels with those that its walls enclose, where their shadow is not seen in there.
 
     Parameters
@@ -58,14 +77,16 @@ def without_rings(body: VoxelGrid, masks: Iterable[View]) -> BoolArray:
     body : VoxelGrid
         The body.
     masks : iterable of View
-        Shadow masks.
+        Shadow masks; none is taken where the walls enclose nothing.
+    cell_m : float
+        Cross-range resolution of the views, m.
 
     Returns
     -------
     ndarray of bool, shape (nz, ny, nx)
         The body's own array where nothing is filled.
     """
-    free = enclosed(body.occupied)
+    free = enclosed(body.occupied, _GAP_CELLS * cell_m / body.volume.voxel_size_m)
     labels, count = scipy.ndimage.label(free[0])
     if not count:
         return body.occupied
