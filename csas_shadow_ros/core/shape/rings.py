@@ -21,11 +21,16 @@ from .volume import VoxelGrid
 
 BoolArray = NDArray[np.bool_]
 
-#: The walls' shadow counts clear of its edges by so much (resolution cells), which speckle roughens.
+#: The walls' shadow counts clear of its edges by so much (resolution cells), which speckle roughens. Neither
+#: half nor double changes what is filled below.
 _CLEAR_CELLS = 1.0
-#: Walls have gaps, where a view or two see past them, of up to twice this (cross-range cells).
+#: Walls have gaps, where a view or two see past them, of up to twice this (cross-range cells). A slab of
+#: 0.9 x 0.7 x 0.1 m under a table has 0.87 and 0.86 of its hull with it (steps of 3 and 6 degrees); at half
+#: 0.86 and 0.60, at double 0.90 and 0.83.
 _GAP_CELLS = 1.0
-#: What is enclosed is a hollow if this share of the walls' shadow on its ground is dark.
+#: What is enclosed is a hollow if this share of the walls' shadow on its ground is dark: 0.13 over that slab,
+#: 0.38 to 0.47 in a cage of bars. At half the slab's shape is the same; at double too, and the cage is
+#: filled.
 _HOLLOW = 0.3
 
 
