@@ -12,7 +12,7 @@ from core_data import make_info
 from csas_shadow_ros.core.geometry import View
 from csas_shadow_ros.core.imaging.mask_codes import MASK_COVERED, MASK_OUTSIDE, MASK_SHADOW, MASK_UNKNOWN
 from csas_shadow_ros.core.shape.explained import cast_shadow
-from csas_shadow_ros.core.shape.rings import enclosed, without_rings
+from csas_shadow_ros.core.shape.rings import enclosed, filled_rings
 from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 
 INFOS = tuple(make_info(math.radians(a), size=256, spacing_m=0.012) for a in range(0, 360, 30))
@@ -50,7 +50,7 @@ def views_of(body, lit=None):
 @pytest.mark.parametrize("lit", [MASK_OUTSIDE, MASK_COVERED])
 def test_ground_that_is_lit_where_the_walls_cast_their_shadow_is_a_top(lit):
     body = walls()
-    filled = without_rings(body, views_of(body, lit), CELL_M)
+    filled = filled_rings(body, views_of(body, lit), CELL_M)
     x, y = np.meshgrid(np.abs(VOLUME.x_m), np.abs(VOLUME.y_m))
     assert np.array_equal(filled[VOLUME.z_m < 0.2], np.broadcast_to((x < 0.48) & (y < 0.38), (5, *x.shape)))
     assert not filled[VOLUME.z_m > 0.2].any()
@@ -59,7 +59,7 @@ def test_ground_that_is_lit_where_the_walls_cast_their_shadow_is_a_top(lit):
 @pytest.mark.parametrize("lit", [None, MASK_UNKNOWN])
 def test_ground_in_the_walls_shadow_or_under_an_echo_stays_as_it_is(lit):
     body = walls()
-    assert without_rings(body, views_of(body, lit), CELL_M) is body.occupied
+    assert filled_rings(body, views_of(body, lit), CELL_M) is body.occupied
 
 
 @pytest.mark.parametrize(("gap_m", "closed"), [(0.08, True), (0.24, False)])

@@ -35,7 +35,7 @@ from ..threads import in_order
 from .explained import ShadowFit, count_shadow_pixels, mean_fit, shadow_fit, unexplained_shadow
 from .layover import echo_zone, opaque_part
 from .plan import StandingPlan, plan_of_sides, shadow_sides
-from .rings import without_rings
+from .rings import filled_rings
 from .seabed import SeabedSlope, seabed_slope, shadow_end
 from .threshold import LEAST_VOXELS, least_threshold, least_views_fraction, thresholded
 from .volume import MARGIN_SHARE, Target, Volume, VoxelGrid
@@ -783,7 +783,7 @@ class Carver:
         views = (kept.view() for kept in self._masks.values())
         if slope is not None:
             views = (replace(view, info=slope.corrected(view.info)) for view in views)
-        occupied = without_rings(told, views, cell_m)
+        occupied = filled_rings(told, views, cell_m)
         if occupied is told.occupied:
             return told
         # What is lit there is the body's own top: no view contradicts.
@@ -813,8 +813,10 @@ class Carver:
         faces = self._mostly_under(_FACING, body, whole.occupied & ~body.occupied)
         fit = self.misfit([whole, *others]) if unexplained >= _EXPLAINED else (math.nan, math.nan)
         explained = unexplained - fit[0]
-        stands = beside._lit_off(plan, [whole, *others]) - beside._lit_off(plan, [body, *others])
-        may_be_whole = unexplained >= _EXPLAINED and stands <= _LIT_OFF_PLAN * explained
+        may_be_whole = unexplained >= _EXPLAINED and (
+            self._lit_off(plan, [whole, *others]) - self._lit_off(plan, [body, *others])
+            <= _LIT_OFF_PLAN * explained
+        )
         # What shines through under a slab would be lit by more than its shadows explain.
         if (
             may_be_whole

@@ -45,7 +45,9 @@ _LEAST_CELLS = 2.0
 _AGREE, _SAME = 0.9, 0.05
 #: No contour lies before the middle of its plan all round the circle: shadow that begins there shows through
 #: a hole, or covers a dark top, and its length tells too much. More than so many resolution cells
-#: down-range before it, in the median of the views, tell no height.
+#: down-range before it, in the median of the views, tell no height. On the population's development half it
+#: does so of 13 bodies, whose heights all came out too high, by 1.3 to 14 tan ψ cells (σ: 1). At half the
+#: same; at double a keg that is too high by 12 tan ψ cells has a height again.
 _BEFORE_CELLS = 0.5
 #: A top is round if its contour drops from its middle to its sides by more than this share of what a sphere
 #: with a contour there does. Of the shapes above flat tops drop by -0.1 to 0.5, spheres by 2.6 to 3.2 (their

@@ -74,7 +74,7 @@ def _closed(layer: BoolArray, radius: float) -> BoolArray:
     return np.asarray(layer | closed[room:-room, room:-room])
 
 
-def without_rings(body: VoxelGrid, masks: Iterable[View], cell_m: float) -> BoolArray:
+def filled_rings(body: VoxelGrid, masks: Iterable[View], cell_m: float) -> BoolArray:
     """Return a body's voxels with those that its walls enclose, where their shadow is not seen in there.
 
     Parameters
@@ -122,4 +122,4 @@ def _shade_at(mask: View, body: VoxelGrid, ground: NDArray[np.float64]) -> tuple
     return inside & clear[v, u] & (pixels != MASK_UNKNOWN), pixels == MASK_SHADOW
 
 
-__all__ = ["enclosed", "without_rings"]
+__all__ = ["enclosed", "filled_rings"]
