@@ -903,8 +903,7 @@ def measure_object(
     elif height is None:
         # Flat or round: half-way. The true top lies anywhere in the cap, or where half of the views end.
         height = standing_height(sides, measured, grid, sigma)
-        # Views that lay beside one another across range also do so down-range, which nothing tells: half of
-        # them keep more of a top for that alone.
+        # Views that lay beside one another do so down-range too: half keep more of a top for that alone.
         share = 0.0 if any(side.shift_m for side in sides) else _TIP_SHARE
         height = height or _cap_height(cap, down * math.tan(grazing), share)
         sigma = math.hypot(sigma, max(cap.half_m - height, height - cap.begins_m, 0.0) / _SIGMAS_95)

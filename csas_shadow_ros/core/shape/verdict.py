@@ -80,15 +80,17 @@ def judge(result: Result) -> None:
 
 
 def _needed_image(result: Result) -> str:
-    """Return what image would hold the shadows, if the object is as high as carving lets it be."""
-    found = result.dimensions
-    if found is None:
+    """Return what image would hold the shadows of what was carved."""
+    grid = result.grid
+    if grid is None or not grid.occupied.any():
         return "a larger image"
-    top = float(np.nanmax([found.height_m, found.hull_top_m]))
+    volume, d = grid.volume, grid.volume.voxel_size_m
+    k, j, i = np.nonzero(grid.occupied)
+    top = float(volume.z_m[k.max()]) + d / 2.0
+    place = np.array([volume.x_m[i].mean(), volume.y_m[j].mean()])
     sonars = np.array([side.info.camera.sonar_m for side in result.sides])
-    place = np.asarray(found.position_m)
     behind = top * np.hypot(*(sonars[:, :2] - place).T) / np.maximum(sonars[:, 2] - top, top)
-    half = float(np.hypot(*place)) + math.hypot(found.length_m, found.width_m) / 2.0 + float(behind.max())
+    half = float(np.hypot(volume.x_m[i], volume.y_m[j]).max()) + d / 2.0 + float(behind.max())
     return f"an image of at least {2.0 * half:.1f} m"
 
 
