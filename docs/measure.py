@@ -249,7 +249,7 @@ def carve(names: tuple[str, ...]) -> None:
         rows: dict[str, float] = {"default (consensus)": iou(grid.occupied, hull)}
         both = _carve(keep.masks("zone"), volume, "consensus")
         rows["  one look only"] = iou(both.first_look().occupied, hull)
-        enough = grid.views >= CarvingParameters().min_views_fraction * grid.views.max()
+        enough = grid.views >= 0.25 * grid.views.max()
         known = np.where(enough, grid.likelihood, np.float32(np.nan))
         rows["  high tops unknown"] = iou(occupied_voxels(known, grid.threshold, "consensus"), hull)
         for label, unknown in (("  echo alone unknown", "echo"), ("  echo read as outside", "none")):

@@ -70,7 +70,8 @@ _NET_EXPLAINED = 0.012
 _LIT_OF_EXPLAINED = 1.0 / 3.0
 #: And so much at most (share of what it explains) where nothing on its plan can echo. Fifteen bodies of the
 #: development half that come back cast 0.00 to 0.03 there; a table on thin legs, whose shadows are lost, as a
-#: block 0.27 to 0.83 (three headings, steps of 3 to 12 degrees). At half and at double the same come back.
+#: block 0.27 to 0.83 (three headings, steps of 3 to 12 degrees). Chosen on both. At half and at
+#: double the same come back.
 _LIT_OFF_PLAN = 0.1
 #: And less than this share of its views contradicts most of what comes back: a face is lit from half of the
 #: circle at most, the seabed between bodies from nearly all of it. Of bodies of the development half 0.04 to
@@ -814,8 +815,7 @@ class Carver:
         fit = self.misfit([whole, *others]) if unexplained >= _EXPLAINED else (math.nan, math.nan)
         explained = unexplained - fit[0]
         may_be_whole = unexplained >= _EXPLAINED and (
-            self._lit_off(plan, [whole, *others]) - self._lit_off(plan, [body, *others])
-            <= _LIT_OFF_PLAN * explained
+            self._more_lit_off(plan, whole, body, others) <= _LIT_OFF_PLAN * explained
         )
         # What shines through under a slab would be lit by more than its shadows explain.
         if (
@@ -897,7 +897,10 @@ class Carver:
         carver = self._in(plan.volume_round(self.volume))
         cleared = carver._clear_of(others)._clear_of_plan(plan)
         left = cleared.first_look()
-        body = self._bounded(replace(left, occupied=left.occupied & plan.columns(left.volume)))
+        occupied = left.occupied & plan.columns(left.volume)
+        # All views bound the plan.
+        views = np.where(occupied, np.uint16(len(self.stamps)), left.views)
+        body = replace(left, occupied=occupied, views=views)
         if not body.occupied.any():
             return None
         most = sum(cleared.misfit([seen, *others])) if seen.occupied.any() else _LOST
@@ -925,20 +928,23 @@ class Carver:
                 shares.append(np.count_nonzero(dark & plan.top(view.info)) / count)
         return float(np.mean(shares)) if shares else math.nan
 
-    def _lit_off(self, plan: StandingPlan, bodies: Sequence[VoxelGrid]) -> float:
-        """Return the share of a body's shadow that is lit where nothing on its plan can echo.
+    def _more_lit_off(
+        self, plan: StandingPlan, whole: VoxelGrid, body: VoxelGrid, others: Sequence[VoxelGrid]
+    ) -> float:
+        """Return how much more of its shadow a whole casts on light that nothing on its plan can echo.
 
         Covered pixels there are seabed: what shines between the legs of a table, say.
         """
 
         def told(kept: KeptMask) -> KeptMask:
             view = kept.view()
-            covered = view.pixels == MASK_COVERED
-            lit = np.where(covered, np.uint8(MASK_OUTSIDE), view.pixels)
-            return _unknown_where(KeptMask.of(replace(view, pixels=lit)), plan.echo(kept.info))
+            lit = (view.pixels == MASK_OUTSIDE) | (view.pixels == MASK_COVERED)
+            says = np.where(plan.echo(kept.info), np.uint8(MASK_UNKNOWN), np.uint8(MASK_OUTSIDE))
+            return KeptMask.of(replace(view, pixels=np.where(lit, says, view.pixels)))
 
-        masks = {stamp: told(kept) for stamp, kept in self._masks.items()}
-        return mean_fit(compared_shadows(masks, bodies).values()).lit
+        masks = {kept.info.stamp_ns: seen for kept, seen in in_order(told, self._masks.values(), _LOOKERS)}
+        more, less = (mean_fit(compared_shadows(masks, [one, *others]).values()).lit for one in (whole, body))
+        return more - less
 
     def _own_plan(self, body: VoxelGrid, within: Volume) -> StandingPlan | None:
         """Return the plan that the sides of a body's shadows bound within a volume, if they bound one."""
@@ -960,14 +966,10 @@ class Carver:
         return again
 
     def _with(self, body: VoxelGrid, other: VoxelGrid, voxels: NDArray[np.bool_]) -> VoxelGrid:
-        """Add some voxels of another body to one."""
+        """Add some voxels of another body to one, on a plan that all views bound."""
         likelihood = np.where(voxels, other.likelihood, body.likelihood)
-        views = np.where(voxels, self._bounded(other).views, body.views)
+        views = np.where(voxels, np.uint16(len(self.stamps)), body.views)
         return replace(thresholded(self.volume, likelihood, views, self.parameters), seabed=body.seabed)
-
-    def _bounded(self, body: VoxelGrid) -> VoxelGrid:
-        """Count for the voxels of a body that stands on a known plan all views, as all of these bound it."""
-        return replace(body, views=np.where(body.occupied, np.uint16(len(self.stamps)), body.views))
 
     def shadow_fits(self, grids: Sequence[VoxelGrid]) -> dict[int, ShadowFit]:
         """Compare the carving silhouettes with bodies' shadows, its own body's first, by stamp.

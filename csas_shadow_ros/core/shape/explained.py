@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import View
+from ..geometry import View, ViewInfo
 from ..imaging.mask_codes import MASK_OUTSIDE, MASK_SHADOW
 from ..kernels import kernel
 from .volume import Volume, VoxelGrid
@@ -113,11 +113,11 @@ def cast_shadow(mask: View, volume: Volume, occupied: BoolArray) -> BoolArray:
     return cast
 
 
-def _about(pixels: BoolArray, mask: View) -> BoolArray:
-    """Extend pixels by what a silhouette's edge is rough."""
+def about(pixels: BoolArray, info: ViewInfo, cells: float = ROUGH_CELLS) -> BoolArray:
+    """Extend pixels by so many resolution cells; by default by what a silhouette's edge is rough."""
     rows, cols = (
-        math.ceil(ROUGH_CELLS * cell / spacing)
-        for cell, spacing in zip(mask.info.resolution_m, mask.info.camera.spacing_m, strict=True)
+        math.ceil(cells * cell / spacing)
+        for cell, spacing in zip(info.resolution_m, info.camera.spacing_m, strict=True)
     )
     box = np.ones((2 * rows + 1, 2 * cols + 1), np.uint8)
     return np.asarray(cv2.dilate(pixels.view(np.uint8), box).view(np.bool_))
@@ -138,7 +138,7 @@ def unexplained_shadow(mask: View, grids: Sequence[VoxelGrid]) -> BoolArray:
     ndarray of bool, shape (rows, cols)
     """
     cast = np.logical_or.reduce([cast_shadow(mask, grid.volume, grid.occupied) for grid in grids])
-    return np.asarray((mask.pixels == MASK_SHADOW) & ~_about(cast, mask))
+    return np.asarray((mask.pixels == MASK_SHADOW) & ~about(cast, mask.info))
 
 
 def shadow_fit(mask: View, grids: Sequence[VoxelGrid]) -> ShadowFit:
@@ -153,9 +153,9 @@ def shadow_fit(mask: View, grids: Sequence[VoxelGrid]) -> ShadowFit:
     """
     dark = np.asarray(mask.pixels == MASK_SHADOW)
     own, *others = (cast_shadow(mask, grid.volume, grid.occupied) for grid in grids)
-    lit = own & (mask.pixels == MASK_OUTSIDE) & ~_about(dark, mask)
+    lit = own & (mask.pixels == MASK_OUTSIDE) & ~about(dark, mask.info)
     cast = np.logical_or.reduce([own, *others])
-    return ShadowFit(_share(dark & ~_about(cast, mask), dark), _share(lit, own))
+    return ShadowFit(_share(dark & ~about(cast, mask.info), dark), _share(lit, own))
 
 
 def mean_fit(fits: Iterable[ShadowFit]) -> ShadowFit:

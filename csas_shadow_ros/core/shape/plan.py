@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..geometry import TWO_PI, View, ViewInfo, cross_range_axis
 from ..imaging.mask_codes import MASK_SHADOW
-from .explained import ROUGH_CELLS, cast_shadow
+from .explained import about, cast_shadow
 from .layover import layover_per_metre
 from .volume import MARGIN_SHARE, Volume, VoxelGrid
 
@@ -251,9 +251,7 @@ class StandingPlan:
         ndarray of bool, shape (rows, cols)
         """
         foot, top = (_filled(info, self._pixels(info, z)) for z in (0.0, self.height_m))
-        down, across = (math.ceil(px) for px in _cells_px(info, (ROUGH_CELLS, ROUGH_CELLS)))
-        box = np.ones((2 * down + 1, 2 * across + 1), np.uint8)
-        return np.asarray(cv2.erode((foot & top).view(np.uint8), box).view(np.bool_))
+        return ~about(~(foot & top), info)
 
     def _pixels(self, info: ViewInfo, height_m: float) -> FloatArray:
         """Return where its corners are imaged at some height, (column, row)."""

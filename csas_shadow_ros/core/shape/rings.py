@@ -9,14 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-import cv2
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
 from ..geometry import View
 from ..imaging.mask_codes import MASK_SHADOW, MASK_UNKNOWN
-from .explained import cast_shadow
+from .explained import about, cast_shadow
 from .volume import VoxelGrid
 
 BoolArray = NDArray[np.bool_]
@@ -29,8 +28,8 @@ _CLEAR_CELLS = 1.0
 #: 0.86 and 0.60, at double 0.90 and 0.83.
 _GAP_CELLS = 1.0
 #: What is enclosed is a hollow if this share of the walls' shadow on its ground is dark: 0.13 over that slab,
-#: 0.38 to 0.47 in a cage of bars. At half the slab's shape is the same; at double too, and the cage is
-#: filled.
+#: 0.38 to 0.47 in a cage of bars. Chosen on these two. At half the slab's shape
+#: is the same; at double too, and the cage is filled.
 _HOLLOW = 0.3
 
 
@@ -109,12 +108,7 @@ def filled_rings(body: VoxelGrid, masks: Iterable[View], cell_m: float) -> BoolA
 
 def _shade_at(mask: View, body: VoxelGrid, ground: NDArray[np.float64]) -> tuple[BoolArray, BoolArray]:
     """Say of places (x, y, 1) whether the body's shadow falls there in a view, and whether they are dark."""
-    cast = cast_shadow(mask, body.volume, body.occupied).view(np.uint8)
-    down, across = (
-        math.ceil(_CLEAR_CELLS * cell / spacing)
-        for cell, spacing in zip(mask.info.resolution_m, mask.info.camera.spacing_m, strict=True)
-    )
-    clear = cv2.erode(cast, np.ones((2 * down + 1, 2 * across + 1), np.uint8)).view(np.bool_)
+    clear = ~about(~cast_shadow(mask, body.volume, body.occupied), mask.info, _CLEAR_CELLS)
     u, v = np.rint(mask.info.camera.ground_to_pixel[:2] @ ground).astype(np.intp)
     inside = (u >= 0) & (u < clear.shape[1]) & (v >= 0) & (v < clear.shape[0])
     u, v = np.where(inside, u, 0), np.where(inside, v, 0)
