@@ -84,7 +84,7 @@ def decision_to_msg(
     """
     values: dict[str, Value] = {} if run_ns is None else {"run": int(run_ns)}
     values |= {"target": int(target_stamp_ns), "may_move": bool(may_move)} | sign_values(decision.sign)
-    values |= detectable_values(decision.detectable)
+    values |= detectable_values(decision.detectable) | {"others_step_rad": decision.others_step_rad}
     # The target is body 1; where there is none, that number stays free.
     bodies = dict(enumerate(decision.others, start=2))
     if decision.target is not None:
@@ -113,6 +113,7 @@ def decision_from_msg(msg: Any) -> SearchNews:
     target = bodies.pop(1, None)
     frame = frame_of(msg, _WHERE)
     told = left_out_of(statuses), sign_of(run), frame, detectable_of(run)
-    decision = Decision(target, tuple(bodies.values()), *told)
+    step = run.real("others_step_rad", finite=True) if "others_step_rad" in run else 0.0
+    decision = Decision(target, tuple(bodies.values()), *told, others_step_rad=step)
     run_ns = run.whole("run") if "run" in run else None
     return SearchNews(stamp_ns, decision, run_ns, run.whole("target"), run.truth("may_move"))

@@ -98,8 +98,7 @@ class ProcessedView:
 
 def process(view: View, stage: str, decision: Decision, p: PipelineParameters) -> list[ProcessedView]:
     """Process one view from its stage on, for the target and, from sub-apertures, the other bodies."""
-    bodies = (decision.target, *(decision.others if stage == "sub_aperture" else ()))
-    return [ProcessedView(body, p, **{stage: view}) for body in bodies]
+    return [ProcessedView(body, p, **{stage: view}) for body in decision.bodies_of(view.info, stage)]
 
 
 def run(

@@ -29,7 +29,7 @@ from .imaging.masks import KeptMask
 from .imaging.segmentation import require_silhouette
 from .parameters import PipelineParameters
 from .search.decision import Decision
-from .search.pieces import APART_CELLS, is_same_body, nothing_left, objects_of, without_neighbours
+from .search.pieces import APART_CELLS, is_same_body, objects_of, without_neighbours
 from .shape.alignment import SCATTER_CELLS, shifts_across
 from .shape.carving import Carver, compared_shadows
 from .shape.explained import ShadowFit, mean_fit
@@ -57,9 +57,6 @@ Item = TypeVar("Item", float, View)
 
 #: What of a view can be taken in: by which the target is carved, measured, and its hollows told.
 PARTS = ("likelihood", "mask", "levels", "sides", "look")
-#: So often (views) it is looked whether a further body can still be an object: looking costs about as much
-#: as carving it with one view.
-_LOOK_EVERY = 16
 #: Views that wait for their silhouette at most, where it comes apart from them: twice the largest window.
 _WAITING = 16
 
@@ -99,8 +96,6 @@ class Body:
         self.looks: dict[int, EchoLook] = {}
         #: Why the first view that was not usable was not.
         self.refused = ""
-        #: Nothing can be left of it any more: it takes no further views.
-        self.given_up = False
         self._masks: dict[int, KeptMask] = {}
         self._shows = judged and not self.carver.keeps_masks
         #: Silhouettes by which the result is judged, where the carver keeps none.
@@ -301,8 +296,6 @@ class Reconstruction:
         self.timings_s: dict[str, float] = {}
         #: Frame of the run; None before the first view, where no decision says it.
         self.frame = decision.frame
-        #: How many views there will be at most; 0: nobody knows.
-        self.most_views = 0
         #: Views that were lost on their way here, as a source has said.
         self.views_lost = 0
         self._compose = compose
@@ -329,13 +322,7 @@ class Reconstruction:
         own = self.bodies[body]
         if view.info is not None:
             self._require_frame(view.info)
-        if own.given_up:
-            return False
         fresh = own.add(view, parts)
-        looks = len(own.carver.stamps) % _LOOK_EVERY == 0
-        if body and fresh and self.most_views and looks and not own.target.stands:
-            own.given_up = own.carver.hopeless(self.most_views)
-            return True
         pixels = view.mask if "mask" in parts else view.likelihood
         if fresh and body == 0 and pixels is not None:
             half = pixels.info.aperture_rad / 2.0
@@ -390,7 +377,6 @@ class Reconstruction:
             How many items there were.
         """
         began = time.perf_counter()
-        self.most_views = total
 
         def ready(item: Item) -> list[ProcessedView | ViewError] | ViewError:
             try:
@@ -425,7 +411,7 @@ class Reconstruction:
 
     def _made_or_not(self, number: int, view: ProcessedView) -> ProcessedView | ViewError:
         try:
-            return _made(view, () if self.bodies[number].given_up else self.parts_of(number))
+            return _made(view, self.parts_of(number))
         except ViewError as error:
             return error
 
@@ -606,7 +592,7 @@ class Reconstruction:
         Where there are several objects each is carved again without what the others' echoes may cover. What a
         body's own echo may have taken comes back once the others are known.
         """
-        usable = {n: body for n, body in enumerate(self.bodies) if body.carver.stamps and not body.given_up}
+        usable = {n: body for n, body in enumerate(self.bodies) if body.carver.stamps}
         shapes = {n: body.shape() for n, body in usable.items()}
         if 0 in shapes:
             shapes[0] = self._without_neighbours(shapes[0])[0]
@@ -650,9 +636,6 @@ class Reconstruction:
     def _add_objects(result: Result, body: Body, whole: VoxelGrid | None) -> None:
         """Add what a further body turned out to be, without what was reported before it."""
         place = body.target.position_m
-        if body.given_up:
-            result.left_out.append(nothing_left(place))
-            return
         if whole is None:
             result.left_out.append(LeftOut(place, f"no view of it was usable: {body.refused}"))
             return

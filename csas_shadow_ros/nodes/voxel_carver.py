@@ -227,8 +227,6 @@ class VoxelCarverNode(CsasNode):
         if beat.values.get("stream") != "sector" and own:
             if self.reconstruction is not None:
                 self.reconstruction.views_lost = beat.counts.get("lost", 0)
-                if not beat.counts.get("more_to_come", 1):
-                    self.reconstruction.most_views = beat.counts.get("total", 0)
             self.growing.source_says(self.inlet.instance in beat.values.get("finished_for", "").split())
 
     # Results
@@ -237,10 +235,6 @@ class VoxelCarverNode(CsasNode):
         """Publish the changes."""
         if not self.active or self.rival:
             return
-        made = self.reconstruction
-        if self.further is not None and made is not None and all(b.given_up for b in made.bodies[1:]):
-            self.further.close()
-            self.further = None
         before = self.growing.complete
         self.growing.set_rate(self.parameters.publish_hz)
         self.growing.tick(time.monotonic())

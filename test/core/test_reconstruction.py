@@ -15,7 +15,6 @@ from csas_shadow_ros.core.parameters import CarvingParameters, PipelineParameter
 from csas_shadow_ros.core.pipeline import ProcessedView
 from csas_shadow_ros.core.reconstruction import Reconstruction
 from csas_shadow_ros.core.search.decision import Decision
-from csas_shadow_ros.core.shape.carving import Carver
 from csas_shadow_ros.core.shape.verdict import cut_sides
 from csas_shadow_ros.core.shape.volume import Target
 from csas_shadow_ros.simulation import simulate
@@ -115,24 +114,6 @@ def test_what_silhouettes_are_too_little_for_is_carved_from_the_mean_likelihood(
     assert found.quality.verdict != "good"
     assert any("mean likelihood of all views" in reason for reason in found.quality.reasons)
     assert not found.dimensions.intervals
-
-
-def test_a_body_is_given_up_only_where_nothing_can_be_left_of_it(whole):
-    result, views = whole
-    empty = Target((0.5, 0.45), (0.2, 0.2, 0.2))
-    nothing, object_ = (Carver(t.volume(0.03), COARSE.carving) for t in (empty, result.target))
-    given_up = None
-    for count, view in enumerate(views, start=1):
-        for carver in (nothing, object_):
-            carver.integrate(view.mask)
-        if given_up is None and nothing.hopeless(len(views)):
-            given_up = count
-        assert not object_.hopeless(len(views))
-    assert given_up is not None
-    assert given_up < len(views)
-    assert not nothing.grid().occupied.any(), "as was foretold"
-    # The more views may still come, the more must contradict.
-    assert not nothing.hopeless(100 * len(views))
 
 
 def test_a_volume_that_cuts_the_object_is_told(whole):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
@@ -32,6 +33,12 @@ from .detectable import detectable_of
 
 #: How many views from all round look for the target: one every 10°, as the search in an image makes them.
 _SEARCH_VIEWS = 36
+#: Further bodies take views so far apart (share of the aperture): two of them share half of their data. All
+#: figures of docs/population.md are of views that far apart, also of the target. What half and double do is
+#: in docs/method.md.
+_OTHERS_APART = 0.5
+#: An aspect is one of those if it is this near to it (rad): far below the least step, 0.1°.
+_SAME_ASPECT_RAD = 1e-4
 PHANTOM = "a phantom: shadows of other bodies cross over it, and it does not reach down to the seabed"
 
 
@@ -53,6 +60,8 @@ class Decision:
         Name of the scene frame that places are in; None: that of the views, whichever it is.
     detectable : Detectable or None
         Where the search found nothing: what it would have found.
+    others_step_rad : float
+        Further bodies take the views whose aspects are multiples of it; 0: all views.
     """
 
     target: Target | None
@@ -61,6 +70,14 @@ class Decision:
     sign: SignEvidence | None = None
     frame: str | None = None
     detectable: Detectable | None = None
+    others_step_rad: float = 0.0
+
+    def bodies_of(self, view: ViewInfo, stage: str) -> tuple[Target | None, ...]:
+        """Return the bodies that take a view of a stage: the target, and of sub-apertures the others."""
+        step = self.others_step_rad
+        off = abs(math.remainder(view.aspect_rad, step)) if step else 0.0
+        further = stage == "sub_aperture" and off < _SAME_ASPECT_RAD
+        return (self.target, *(self.others if further else ()))
 
     def require_frame(self, view: ViewInfo) -> None:
         """Refuse a view in another frame.
@@ -173,12 +190,15 @@ def decide_by_image(
 
     `parameters.sub_aperture.check_sign` says whether the spectrum's sign is checked. Errors: see `decide`.
     """
-    p = parameters.target
-    if parameters.sub_aperture.check_sign:
+    p, views = parameters.target, parameters.sub_aperture
+    sign, search = None, None
+    if views.check_sign:
         sign, search = spectrum_sign_evidence(image, track, spectrum=spectrum)
-        return decide(search, p, sign, max_objects)
-    given = p.target == "given" and all(s > 0 for s in p.size_m)
-    return decide(None if given else search_image(image, track, spectrum), p, None, max_objects)
+    elif not (p.target == "given" and all(s > 0 for s in p.size_m)):
+        search = search_image(image, track, spectrum)
+    every = max(1, math.floor(_OTHERS_APART * views.aperture_deg / views.step_deg + 1e-9))
+    decision = decide(search, p, sign, max_objects)
+    return replace(decision, others_step_rad=every * math.radians(views.step_deg))
 
 
 def decide_by_views(

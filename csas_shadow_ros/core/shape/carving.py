@@ -19,6 +19,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ from .layover import echo_zone, opaque_part
 from .plan import StandingPlan, plan_of_sides, shadow_sides
 from .rings import filled_rings
 from .seabed import SeabedSlope, seabed_slope, shadow_end
-from .threshold import LEAST_VOXELS, least_threshold, least_views_fraction, thresholded
+from .threshold import least_views_fraction, thresholded
 from .volume import MARGIN_SHARE, Target, Volume, VoxelGrid
 
 #: l_out is accumulated in steps of 1/4096, far below the spread of its estimate.
@@ -46,6 +47,8 @@ _SCALE = 4096
 _SECOND_LOOK_VOXELS = 2
 #: Threads that do it.
 _LOOKERS = 2
+#: So many comparisons of bodies with the silhouettes are kept: those of one result.
+_KEPT_FITS = 4
 #: Voxels a side of the square blocks of a slice that are counted as one where a mask allows it.
 _BLOCK = 8
 #: Of a block that is not, parts of so many voxels a side are.
@@ -566,8 +569,8 @@ class Carver:
         self._pool = pool
         self._sums = _Sums(volume, pool)
         self._masks: dict[int, KeptMask] = {}
-        #: The last comparison of `shadow_fits`, by its bodies and the number of views.
-        self._fits: tuple[tuple[Sequence[VoxelGrid], int], dict[int, ShadowFit]] | None = None
+        #: The last comparisons of `shadow_fits`, by their bodies and the number of views.
+        self._fits: dict[tuple[tuple[VoxelGrid, ...], int], dict[int, ShadowFit]] = {}
         #: Stamps of the views that have been integrated.
         self.stamps: set[int] = set()
 
@@ -634,21 +637,6 @@ class Carver:
     def likelihood(self) -> NDArray[np.float32]:
         """Return the mean of l_out (masks: the fraction of views that contradict the voxel); NaN unknown."""
         return _mean(self._sums.total, self._sums.count, self.parameters, len(self.stamps))
-
-    def hopeless(self, most_views: int) -> bool:
-        """Say whether no object can remain, even if no further view contradicts a voxel.
-
-        Parameters
-        ----------
-        most_views : int
-            So many views will be integrated in all, at most.
-        """
-        threshold = least_threshold(self.parameters)
-        if threshold is None:
-            return False
-        # A sum only grows, and is divided by as many views at most.
-        limit = threshold * max(most_views, len(self.stamps)) * _SCALE
-        return int(np.count_nonzero(self._sums.total < limit)) < LEAST_VOXELS
 
     def grid(self) -> VoxelGrid:
         """Threshold the voxels carved so far.
@@ -727,12 +715,31 @@ class Carver:
         tops; taken for unknown, they leave an apron round open ones. The leaner body counts, and what of the
         fuller one darkens pixels of the silhouettes that the leaner one leaves lit.
         """
-        fuller = self._second_look(first)
-        lean = self.leaner()
+        box, part = part_around(first.occupied, self.volume, _SECOND_LOOK_VOXELS)
+        near = self._in_part(box, part)
+        fuller = near._second_look(near.first_look())
+        lean = near.leaner()
         leaner = lean.first_look()
         if leaner.occupied.any():
             leaner = lean._second_look(leaner)
-        return self._asked_for(leaner, fuller)
+        found = near._asked_for(leaner, fuller)
+        whole = replace(
+            first,
+            likelihood=first.likelihood.copy(),
+            views=first.views.copy(),
+            occupied=np.zeros_like(first.occupied),
+            threshold=found.threshold,
+        )
+        whole.likelihood[box], whole.views[box] = found.likelihood, found.views
+        whole.occupied[box] = found.occupied
+        return whole
+
+    def _in_part(self, box: tuple[slice, ...], part: Volume) -> Carver:
+        """Return what was carved of a part of the volume."""
+        carver = Carver(part, self.parameters, pool=self._pool)
+        carver._sums = self._sums.part(box, part)
+        carver._masks, carver.stamps = self._masks, self.stamps
+        return carver
 
     def leaner(self) -> Carver:
         """Carve the same views again, covered pixels far before a shadow taken for lit seabed."""
@@ -814,25 +821,27 @@ class Carver:
         faces = self._mostly_under(_FACING, body, whole.occupied & ~body.occupied)
         fit = self.misfit([whole, *others]) if unexplained >= _EXPLAINED else (math.nan, math.nan)
         explained = unexplained - fit[0]
-        may_be_whole = unexplained >= _EXPLAINED and (
-            self._more_lit_off(plan, whole, body, others) <= _LIT_OFF_PLAN * explained
-        )
+
+        @cache
+        def may_be_whole() -> bool:
+            return self._more_lit_off(plan, whole, body, others) <= _LIT_OFF_PLAN * explained
+
         # What shines through under a slab would be lit by more than its shadows explain.
         if (
-            may_be_whole
-            and explained >= _EXPLAINED
+            explained >= _EXPLAINED
             and (faces or (explained >= fit[1] - lit and self._dark_on(plan) < _DARK_TOP))
+            and may_be_whole()
         ):
             return whole
         filled = body
         below = _columns_filled(body.occupied, whole.occupied) & ~body.occupied
         if np.count_nonzero(below) >= _UNDERCUT * count and self._mostly_under(_SELDOM, body, below):
             filled = self._with(body, whole, below)
-        if faces and may_be_whole:
+        if faces and unexplained >= _EXPLAINED:
             dark, lit = self.misfit([filled, *others])
             more, more_lit = dark - fit[0], fit[1] - lit
             net = more - more_lit >= _NET_EXPLAINED and more_lit <= _LIT_OF_EXPLAINED * more
-            return whole if net else filled
+            return whole if net and may_be_whole() else filled
         return filled
 
     @staticmethod
@@ -976,10 +985,12 @@ class Carver:
 
         Empty for methods that keep no silhouettes (soft, hard).
         """
-        asked = tuple(grids), len(self._masks)
-        if self._fits is None or self._fits[0] != asked:  # bodies are equal only to themselves
-            self._fits = asked, compared_shadows(self._masks, grids)
-        return self._fits[1]
+        asked = tuple(grids), len(self._masks)  # bodies are equal only to themselves
+        if asked not in self._fits:
+            while len(self._fits) >= _KEPT_FITS:
+                self._fits.pop(next(iter(self._fits)))
+            self._fits[asked] = compared_shadows(self._masks, grids)
+        return self._fits[asked]
 
     def first_look(self) -> VoxelGrid:
         """Threshold the voxels carved so far, with covered pixels unknown: the start of `grid`."""
@@ -1116,7 +1127,8 @@ def part_around(occupied: NDArray[np.bool_], volume: Volume, margin: int) -> tup
     for axis in range(3):
         other = tuple(a for a in range(3) if a != axis)
         where = np.flatnonzero(occupied.any(axis=other))
-        box.append(slice(max(0, where[0] - margin), min(occupied.shape[axis], where[-1] + margin + 1)))
+        first, last = int(where[0]) - margin, int(where[-1]) + margin
+        box.append(slice(max(0, first), min(occupied.shape[axis], last + 1)))
     origin = tuple(o + box[2 - i].start * volume.voxel_size_m for i, o in enumerate(volume.origin_m))
     shape = tuple(s.stop - s.start for s in box)
     part = Volume((origin[0], origin[1], origin[2]), volume.voxel_size_m, (shape[0], shape[1], shape[2]))

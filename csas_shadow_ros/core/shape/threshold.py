@@ -51,13 +51,6 @@ def object_threshold(likelihood: NDArray[np.float32], method: str) -> float:
     return dark + how.level * (bright - dark) if how.under is None else how.under
 
 
-def least_threshold(parameters: CarvingParameters) -> float | None:
-    """Return the threshold if it is independent of the voxels, otherwise None."""
-    if parameters.threshold:
-        return parameters.threshold
-    return method_named(parameters.method).under
-
-
 def supported(dark: NDArray[np.bool_], likelihood: NDArray[np.float32], limit: float) -> NDArray[np.bool_]:
     """Extend dark voxels downwards, as objects rest on the seabed.
 
