@@ -637,6 +637,7 @@ DECISIONS = {
         TARGETS[1:],
         (LeftOut((1.0, THIRD), "too many; 4 are carved"),),
         SignEvidence(1, THIRD, 2e-9),
+        others_step_rad=THIRD,
     ),
     "one": Decision(TARGETS[1]),
     "none": Decision(None, sign=SignEvidence(-1, 0.0, 0.0)),
@@ -670,6 +671,7 @@ def test_the_target_is_body_one_and_its_place_and_size_have_names(factory):
     [
         (rename("run", "sun"), r"search\.status has 'sun', .*; expected one that is named 'run'"),
         (drop("run", "target"), r"search, status 'run': target is missing"),
+        (value("run", "others_step_rad", "inf"), r"others_step_rad is 'inf'; expected a finite number"),
         (value("run", "may_move", ""), r"status 'run': may_move is ''; expected one of: true, false"),
         (value("body 2", "size_x_m", "0"), r"status 'body 2': size_x_m is '0'; expected more than 0 m"),
         (value("body 1", "stands", "no"), r"status 'body 1': stands is 'no'; expected one of: true, false"),

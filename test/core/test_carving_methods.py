@@ -12,7 +12,6 @@ import pytest
 from csas_shadow_ros.core.errors import CsasError
 from csas_shadow_ros.core.methods import METHODS, Method, method_named
 from csas_shadow_ros.core.parameters import CarvingParameters
-from csas_shadow_ros.core.shape.carving import Carver
 from csas_shadow_ros.core.shape.threshold import (
     needed_threshold,
     object_threshold,
@@ -56,7 +55,6 @@ def test_every_method_carves_with_the_views_that_its_entry_names(name):
     assert p.takes_masks == (method.takes == "shadow_mask")
     assert p.other().method == method.other
     assert thresholded(VOLUME, LIKELIHOOD, VIEWS, p).occupied.sum() == 3 * 4 * 4
-    assert Carver(VOLUME, p).hopeless(0) == (method.under is not None)
 
 
 def test_the_names_that_type_checkers_know_are_those_of_the_table():

@@ -76,6 +76,36 @@ def block_grid(low, high, *, origin=(0.0, 0.0), voxel=0.1, shape=(8, 12, 12)):
 
 
 @of_two
+def test_a_further_body_takes_a_view_each_quarter_of_an_aperture(two):
+    run, _ = two
+
+    def carved(step_deg):
+        views = replace(COARSE.sub_aperture, aperture_deg=24.0, step_deg=step_deg)
+        return pipeline.run(run.image, run.track, replace(COARSE, sub_aperture=views))
+
+    often, rarely = carved(3.0), carved(6.0)
+    assert (often.views_used, rarely.views_used) == (120, 60)
+    assert [one.views_used for one in (*often.further, *rarely.further)] == [60, 60]
+
+
+@of_two
+@pytest.mark.parametrize(
+    ("aspect_deg", "step_deg", "stage", "bodies"),
+    [
+        (6.0, 6.0, "sub_aperture", 2),
+        (-354.0, 6.0, "sub_aperture", 2),
+        (7.0, 6.0, "sub_aperture", 1),
+        (7.0, 0.0, "sub_aperture", 2),
+        (6.0, 6.0, "shadow", 1),
+    ],
+)
+def test_which_bodies_take_a_view(two_objects, aspect_deg, step_deg, stage, bodies):
+    info = replace(two_objects.sides[0].info, aspect_rad=math.radians(aspect_deg))
+    decision = replace(two_objects.decision, others_step_rad=math.radians(step_deg))
+    assert len(decision.bodies_of(info, stage)) == bodies
+
+
+@of_two
 def test_two_separate_bodies_are_two_objects_each_where_and_as_large_as_it_is(two, two_objects):
     _, middles = two
     objects = sorted(two_objects.objects, key=lambda o: o.dimensions.position_m[0])

@@ -33,10 +33,10 @@ from .detectable import detectable_of
 
 #: How many views from all round look for the target: one every 10°, as the search in an image makes them.
 _SEARCH_VIEWS = 36
-#: Further bodies take views so far apart (share of the aperture): two of them share half of their data. All
-#: figures of docs/population.md are of views that far apart, also of the target. What half and double do is
-#: in docs/method.md.
-_OTHERS_APART = 0.5
+#: Further bodies take views so far apart (share of the aperture): two of them share three quarters of their
+#: data. Of seven scenes of the development half with several bodies, at steps of 1°, no body's IoU with
+#: its hull changes by more than 0.01 against all views; at double one loses 0.30 and one 0.08.
+_OTHERS_APART = 0.25
 #: An aspect is one of those if it is this near to it (rad): far below the least step, 0.1°.
 _SAME_ASPECT_RAD = 1e-4
 PHANTOM = "a phantom: shadows of other bodies cross over it, and it does not reach down to the seabed"
