@@ -20,7 +20,7 @@ where the cap begins, and a dome's, and its interval holds the cap.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -61,10 +61,18 @@ _BULGE_WITHIN = 0.8
 _LEAST_CELLS = 4.8
 #: Roughness of an edge that no fit must explain (resolution cells across): a pixel's rounding.
 _ROUGH_CELLS = 0.11
-#: What a side of a silhouette may be: as far out at every range, drawn in upwards, out in its middle, or
-#: straight above a foot that stands out.
-SHAPES = ("straight", "tapering", "round", "flared")
-_STRAIGHT, _FLARED = SHAPES.index("straight"), SHAPES.index("flared")
+#: What a side of a silhouette may be: as far out at every range, drawn in upwards, out in its middle,
+#: straight above a foot that stands out, or one line from its foot to far up that leans inwards.
+SHAPES = ("straight", "tapering", "round", "flared", "leaning")
+_STRAIGHT, _FLARED, _LEANING = (SHAPES.index(name) for name in ("straight", "flared", "leaning"))
+#: A side leans if a line from where it is widest (within so much, resolution cells across) over one of these
+#: shares of the rows from there on is drawn in by so much (across), is so long (down-range; share of the
+#: shadow), and fits the edge to so much (across; rms, and how far its middle bulges). LEANING_FIGURES
+_LEAN_OPEN_CELLS, _LEAN_SHARES = 0.5, (1.0, 0.85, 0.7)
+_LEAN_CELLS, _LEAN_LONG_CELLS, _LEAN_LEAST_SHARE = 3.0, 6.0, 0.5
+_LEAN_ROUGH_CELLS, _LEAN_ROUGH_SHARE = 0.4, 0.05
+#: And if more than this share of the sides see it so that views so far to either side show (apertures).
+_LEAN_VOTES, _LEAN_BESIDE = 1.0 / 3.0, 1.0
 #: A foot is so long (resolution cells down-range), and stands out if the views beside agree on more than this
 #: (across).
 _FOOT_CELLS, _FLARE_CELLS = 14.4, 0.375
@@ -93,6 +101,8 @@ _VOXEL_WEIGHT, _VOXEL_ALONE = 0.1, 1.0
 #: A side that stands out of the carved voxels by more than this (cross-range cells) belongs to something else
 #: whose shadow touches the target's.
 _FOREIGN_CELLS = 3.0
+#: A side that leans down to its foot may stand out by so many times more. LOST_FIGURES
+_FOOT_LOST = 2.0
 #: Fewer edges than this give no plan: the voxels alone are measured then.
 MIN_EDGES = 24
 #: Fewer views than this whose shadow ends in the image tell no height (looks): one or two may be
@@ -175,6 +185,9 @@ class SilhouetteSides:
         The support of each side as the target's own echo tells it, m; NaN where none is seen.
     shift_m : float
         How far along e_c the view lay from its place before it was put back, m (`alignment`).
+    leaning : tuple of (float, float)
+        Direction (rad) across the line that each side leans inwards along, if it does, and the plan's support
+        there, m; NaN where it does not.
     """
 
     info: ViewInfo
@@ -187,6 +200,7 @@ class SilhouetteSides:
     contour: Contour | None = None
     echo_support_m: tuple[float, ...] = ()
     shift_m: float = 0.0
+    leaning: tuple[tuple[float, float], ...] = ()
 
     @property
     def signs(self) -> tuple[int, ...]:
@@ -199,6 +213,7 @@ class SilhouetteSides:
         """Return the sides of the view put back that lies so far along e_c (by stamp, m) from its place."""
         shift = shifts_m.get(self.info.stamp_ns, 0.0)
         back = np.array([-sign * shift for sign in self.signs])
+        across = cross_range_axis(self.info.aspect_rad)
 
         def moved(told: Sequence[float]) -> tuple[float, ...]:
             return tuple((np.array(told) + back[: len(told)]).tolist())
@@ -215,6 +230,10 @@ class SilhouetteSides:
             contour=contour and replace(contour, across_m=tuple(x - shift for x in contour.across_m)),
             echo_support_m=moved(self.echo_support_m),
             shift_m=self.shift_m + shift,
+            leaning=tuple(
+                (phi, out - shift * float(across @ (math.cos(phi), math.sin(phi))))
+                for phi, out in self.leaning
+            ),
         )
 
 
@@ -251,18 +270,22 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
     last = cols - 1 - shadow[rows][:, ::-1].argmax(axis=1).astype(np.float64)
     outside = _OUTSIDE_CELLS * info.resolution_m[1] if math.isfinite(info.focus_range_m) else 0.0
     e_c = cross_range_axis(info.aspect_rad)
-    directions, supports, shapes, echoes = [], [], [], []
+    directions, supports, shapes, echoes, leaning = [], [], [], [], []
     reach_px = echo_reach_px(levels, mask, shadow, (u0, v0))
     middle = (first + last) / 2.0
     for sign, edge in ((1, last), (-1, first)):
         out_px, inner_px = (sign * (column - u0) * scale for column in (edge, middle))
-        found = _side(levels, rows, out_px, inner_px, scale, sign, (u0, v0), info.cell_px)
+        given = levels, rows, out_px, inner_px, scale, sign, (u0, v0), info.cell_px
+        found = _side(*given)
         if found is None:
             continue
         out, shape = found
         axis = sign * e_c
         directions.append(math.atan2(axis[1], axis[0]))
         here = float(axis @ np.asarray(target_m))
+        out_m, lean = _leaning(*given, (row_m, col_m)) or (math.nan, math.nan)
+        axis = math.cos(lean) * axis + math.sin(lean) * down_range_axis(info.aspect_rad)
+        leaning.append((math.atan2(axis[1], axis[0]), out_m + float(axis @ np.asarray(target_m))))
         beyond = {"straight": outside, "flared": outside}
         supports.append(tuple(out[name] * col_m - beyond.get(name, 0.0) + here for name in SHAPES))
         shapes.append(shape)
@@ -281,6 +304,7 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
         cut,
         contour,
         tuple(echoes),
+        leaning=tuple(leaning),
     )
 
 
@@ -332,6 +356,51 @@ def _side(
     )
     out["flared"] = float(foot_px[0]) + beyond_foot
     return None if math.isnan(out[shape]) else (out, shape)
+
+
+def _leaning(
+    levels: Levels,
+    rows: NDArray[np.intp],
+    out_px: FloatArray,
+    inner_px: FloatArray,
+    scale: FloatArray,
+    sign: int,
+    target_px: tuple[float, float],
+    cell_px: tuple[float, float],
+    spacing_m: tuple[float, float],
+) -> tuple[float, float] | None:
+    """Return how far (m) a side that leans inwards lies off the target's place, and how much it leans (rad).
+
+    None where it does not. Rays fan out from the sonar: lines stay lines as both coordinates are taken back
+    to the target's range.
+    """
+    (down_px, across_px), (row_m, col_m), (u0, v0) = cell_px, spacing_m, target_px
+    size = 2 * round(_MEDIAN_HALF_CELLS * down_px) + 1
+    calm, inner_px = (scipy.ndimage.median_filter(px, size, mode="nearest") for px in (out_px, inner_px))
+    # The shadow opens up to where the body's own echo hides it no more. If it runs straight from there and
+    # narrows later, that is the shadow of a top.
+    widest = np.flatnonzero(calm >= calm.max() - _LEAN_OPEN_CELLS * across_px)[0]
+    least = max(_LEAN_LONG_CELLS * down_px, _LEAN_LEAST_SHARE * len(rows))
+    rows, calm, inner_px, scale = rows[widest:], calm[widest:], inner_px[widest:], scale[widest:]
+    along_m = (rows - v0) * scale * row_m
+    for share in _LEAN_SHARES:
+        n = math.ceil(share * len(rows))
+        if n < least:
+            return None
+        along = along_m[:n] / col_m
+        slope, level = np.polyfit(along, calm[:n], 1)
+        line = level + slope * along
+        rough = float(np.sqrt(np.mean((calm[:n] - line) ** 2)))
+        bulge = abs(float(np.polyfit(along, calm[:n], 2)[0])) * float(np.ptp(along)) ** 2 / 4.0
+        drawn_in = -float(slope) * float(np.ptp(along))
+        if drawn_in < _LEAN_CELLS * across_px:
+            continue
+        if max(rough, bulge) > _LEAN_ROUGH_CELLS * across_px + _LEAN_ROUGH_SHARE * drawn_in:
+            continue
+        beyond = _edge_beyond(levels, rows[:n], scale[:n], sign * line, inner_px[:n], sign, u0, across_px)
+        lean = math.atan(-slope)
+        return None if math.isnan(beyond) else (float(level + beyond) * col_m * math.cos(lean), lean)
+    return None
 
 
 def _edge_beyond(
@@ -394,6 +463,45 @@ def _fitted_side(
     return curves, shape, slope
 
 
+def leaning_agreed(sides: Sequence[SilhouetteSides]) -> list[SilhouetteSides]:
+    """Return the sides, those that lean inwards as bounds across their own lines.
+
+    The edge of a shadow that leans from its beginning on is the shadow of a slanting edge or side. The line
+    meets the plan at its foot, and a convex body lies to one side of it: it bounds the plan in the direction
+    across itself. Its shadow alone is too short there to be seen. A side leans if most of the views beside
+    see it so: one view alone may take the far end of a shadow for its side.
+    """
+    lines = np.array([line for side in sides for line in side.leaning]).reshape(-1, 2)
+    if len(lines) != sum(len(side.direction_rad) for side in sides):
+        return list(sides)  # of a program that does not tell them
+    seen = np.isfinite(lines[:, 1])
+    beside = _beside(sides, _LEAN_BESIDE)
+    leans = np.count_nonzero(beside & seen, axis=1) > _LEAN_VOTES * np.count_nonzero(beside, axis=1)
+    out, first = [], 0
+    for side in sides:
+        mine = range(first, first := first + len(side.direction_rad))
+        # Where the others lean and a view tells no line, its shadow ends too early.
+        left = [(own, n) for own, n in enumerate(mine) if seen[n] or not leans[n]]
+
+        def told(own: Sequence[Any], lean: Callable[[int], Any], left: Any = left) -> tuple[Any, ...]:
+            return tuple(lean(n) if leans[n] else own[at] for at, n in left) if len(own) else ()
+
+        out.append(
+            replace(
+                side,
+                direction_rad=told(side.direction_rad, lambda n: float(lines[n, 0])),
+                support_m=told(side.support_m, lambda n: float(lines[n, 1])),
+                shapes=told(side.shapes, lambda _: SHAPES[_LEANING]),
+                support_by_shape_m=told(
+                    side.support_by_shape_m, lambda n: (float(lines[n, 1]),) * len(SHAPES)
+                ),
+                echo_support_m=told(side.echo_support_m, lambda _: math.nan),
+                leaning=told(side.leaning, lambda n: (float(lines[n, 0]), float(lines[n, 1]))),
+            )
+        )
+    return out
+
+
 def agreed_support(sides: Sequence[SilhouetteSides]) -> FloatArray:
     """Return the supports of all sides, each taken for the shape that the sides beside it and all sides have.
 
@@ -425,10 +533,10 @@ def agreed_support(sides: Sequence[SilhouetteSides]) -> FloatArray:
     return np.where(np.isnan(agreed), own, agreed)
 
 
-def _beside(sides: Sequence[SilhouetteSides]) -> NDArray[np.bool_]:
+def _beside(sides: Sequence[SilhouetteSides], apertures: float = 0.5) -> NDArray[np.bool_]:
     """Say which sides look at the same side of the target: within half an aperture of one another."""
     phi = np.array([angle for side in sides for angle in side.direction_rad])
-    half = np.array([side.info.aperture_rad / 2.0 for side in sides for _ in side.direction_rad])
+    half = np.array([apertures * side.info.aperture_rad for side in sides for _ in side.direction_rad])
     away = np.abs(wrap_angle(phi[:, None] - phi[None, :]))
     return np.asarray(away <= half[:, None] + 1e-9)
 
@@ -501,12 +609,16 @@ class PlanFit:
         coarse = _round_circle(_DIRECTIONS)
         own = _voxel_support(grid, coarse)
         self.kept = np.ones(len(seen), np.bool_)
+        leans = np.array([shape == SHAPES[_LEANING] for side in sides for shape in side.shapes], np.bool_)
+        if len(leans) != len(seen):
+            leans = np.zeros(len(seen), np.bool_)
         if len(seen):
             cell = float(np.median([side.info.resolution_m[1] for side in sides]))
             margin = _FOREIGN_CELLS * cell + grid.volume.voxel_size_m
             expected = np.interp(seen[:, 0] % TWO_PI, coarse, own, period=TWO_PI)
-            self.kept = np.abs(seen[:, 1] - expected) <= margin
-            seen = seen[self.kept]
+            # What slopes down to its foot may be carved away there by its own light.
+            self.kept = np.abs(seen[:, 1] - expected) <= np.where(leans, _FOOT_LOST, 1.0) * margin
+            seen, leans = seen[self.kept], leans[self.kept]
         self.count = len(seen)
         self.centre = 2.0 * np.array([np.mean(own * np.cos(coarse)), np.mean(own * np.sin(coarse))])
         self._phi = np.concatenate([seen[:, 0], coarse])
@@ -515,6 +627,8 @@ class PlanFit:
         self._values = np.concatenate([seen[:, 1], own]) - about
         away = np.abs(wrap_angle(coarse[:, None] - seen[None, :, 0]))
         alone = ~(away <= seen[None, :, 2] / 2.0).any(axis=1)
+        if leans.any():
+            alone &= ~leans[away.argmin(axis=1)]  # for the same reason
         weights = np.where(alone, _VOXEL_ALONE, _VOXEL_WEIGHT)
         self._weights = np.concatenate([np.ones(self.count), weights])
         self._robust = np.ones_like(self._weights)
@@ -857,7 +971,7 @@ def measure_object(
     Volume is that of the shadow hull, whose hollows no shadow shows: its interval is that of the hull.
     """
     whole = measure(mesh)
-    sides = sorted(sides, key=lambda side: side.info.stamp_ns)
+    sides = leaning_agreed(sorted(sides, key=lambda side: side.info.stamp_ns))
     by_shadows = agreed_support(sides)
     fit = PlanFit(sides, grid, by_shadows)
     if fit.count < MIN_EDGES:
@@ -925,6 +1039,7 @@ def _cap_height(cap: Cap, cell_m: float, tip_share: float) -> float:
 
 def sides_apart(sides: Sequence[SilhouetteSides]) -> float:
     """Return the share of a body's sides that opposite views see at different places (`opposed_sides`)."""
+    sides = leaning_agreed(sides)
     return opposed_share(opposed_sides(sides, agreed_support(sides))[1])
 
 
