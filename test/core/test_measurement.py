@@ -36,6 +36,7 @@ from csas_shadow_ros.core.shape.measurement import (
     SHAPES,
     PlanFit,
     cap_of,
+    leaning_agreed,
     levels_of_mask,
     measure_object,
     shadow_height,
@@ -169,8 +170,8 @@ def test_a_foot_that_stands_out_of_a_straight_side_counts_if_the_views_beside_ag
     sides = []
     for n, side in enumerate(exact):
         by_shape = tuple(
-            (straight, tapering, rounded, straight + foot_m * (n % 4 != 0))
-            for straight, tapering, rounded, _ in side.support_by_shape_m
+            (straight, tapering, rounded, straight + foot_m * (n % 4 != 0), math.nan)
+            for straight, tapering, rounded, *_ in side.support_by_shape_m
         )
         sides.append(replace(side, support_by_shape_m=by_shape))
     grows = 2 * foot_m * counts
@@ -313,6 +314,18 @@ def test_the_height_is_where_the_cap_begins(half_m):
     k, j, i = (int(index) for index in np.argwhere(occupied)[-1])
     occupied[k + 1, j, i] = True
     assert cap_of(grid_of(occupied), GRAZING).begins_m == pytest.approx(cap.begins_m, abs=1e-9)
+
+
+def test_where_a_cap_begins_is_told_in_cells_however_fine_the_voxels_are():
+    """Layers about a flat top that are drawn in by less than a cell lift where its cap seems to begin."""
+    volume = Volume.around((0.0, 0.0), (0.6, 0.6, 0.4), 0.005)
+    z, y, x = np.meshgrid(volume.z_m, volume.y_m, volume.x_m, indexing="ij")
+    drawn_in = 0.02 * np.clip(1.0 - np.abs(z - 0.2) / 0.06, 0.0, None)
+    half_m = 0.2 - drawn_in - np.clip(z - 0.2, 0.0, None) / math.tan(GRAZING)
+    grid = grid_of(np.maximum(np.abs(x), np.abs(y)) < half_m, volume)
+    by_voxels, by_cells = (cap_of(grid, GRAZING, cell_m=cell).begins_m for cell in (0.0, 0.02))
+    assert by_voxels > 0.23
+    assert by_cells == pytest.approx(0.2, abs=0.02)
 
 
 @pytest.mark.parametrize("hole_m", [0.0, 0.05, 0.3])
@@ -556,6 +569,85 @@ def test_a_side_that_is_drawn_in_upwards_is_followed_to_its_foot_that_the_echo_h
     support = np.concatenate([side.support_m for side in sides])
     assert len(support) == 2 * len(INFOS)
     assert np.median(support) == pytest.approx(0.3, abs=0.012)  # a pixel; the foot hides 2.4 cm
+
+
+def hidden_by_layers(layer, high_m):
+    """Return what hides the seabed: `layer(x, y, z)` says what of each height is body."""
+
+    def hidden(x, y, sonar):
+        out = np.zeros(np.shape(x), bool)
+        for z in np.linspace(0.0, high_m, 41)[:-1]:
+            share = (sonar[2] - z) / sonar[2]
+            out |= layer(sonar[0] + (x - sonar[0]) * share, sonar[1] + (y - sonar[1]) * share, z)
+        return out
+
+    return hidden
+
+
+def lit_on_plan(hidden, plan, infos):
+    """Return perfect views of a body that shines wherever the sonar sees it: no shadow lies on its plan."""
+    views = []
+    for view in perfect_views(hidden, infos, "mask"):
+        pixels = view.pixels.copy()
+        pixels[plan(*ground_of_pixels(view.info.camera))] = MASK_OUTSIDE
+        views.append(View(view.info, pixels))
+    return views
+
+
+def wedge(x, y, z):
+    """A wedge 0.8 m long, 0.4 m wide and 0.3 m high, that slopes down to its thin end at x = 0.4 m."""
+    return (np.abs(y) < 0.2) & (x > -0.4) & (x < 0.4 - 0.8 * z / 0.3)
+
+
+def steep_cone(x, y, z):
+    """A cone 0.6 m wide and 0.3 m high."""
+    return np.hypot(x, y) < 0.3 * (1.0 - z / 0.3)
+
+
+@pytest.mark.parametrize(
+    ("body", "sizes", "kept"), [(wedge, (0.8, 0.4), 0.2), (steep_cone, (0.6, 0.6), 0.24)]
+)
+def test_a_body_that_slopes_down_to_its_foot_is_as_long_as_the_lines_of_its_shadows_say(body, sizes, kept):
+    """Its own light carves its foot away, and its shadow is too short there to be seen."""
+    views = lit_on_plan(hidden_by_layers(body, 0.3), lambda x, y: body(x, y, 0.0), ONE_LOOK)
+    found = [silhouette_sides(levels_of_mask(view), view, (0.0, 0.0)) for view in views]
+    sides = [side for side in found if side is not None]  # along the wedge's slope nothing throws a shadow
+    volume = Volume.around((0.0, 0.0), (1.2, 1.2, 0.4), 0.02)
+    z, y, x = np.meshgrid(volume.z_m, volume.y_m, volume.x_m, indexing="ij")
+    carved = body(x, y, z) & (np.hypot(x, y) < 2.0 * kept) & (x < kept)
+    found = measure_object(grid_of(carved, volume), mesh_from_grid(grid_of(carved, volume)), sides)
+    assert (found.length_m, found.width_m) == pytest.approx(sizes, abs=0.04)  # a cell and a half
+    assert found.intervals["length_m"][0] < sizes[0] < found.intervals["length_m"][1]
+
+
+@pytest.mark.parametrize(
+    "hidden",
+    [
+        partial(hidden_by_box, low=(-0.3, -0.3, 0.0), high=(0.3, 0.3, 0.08)),
+        DRUM,
+        hidden_by_layers(lambda x, y, z: np.hypot(x, y) < np.sqrt(max(0.09 - (z - 0.3) ** 2, 0.0)), 0.6),
+    ],
+    ids=["low box", "drum", "ball"],
+)
+def test_the_far_end_of_a_shadow_is_no_side_that_leans(hidden):
+    sides = leaning_agreed(sides_of(hidden, ONE_LOOK))
+    assert "leaning" not in [shape for side in sides for shape in side.shapes]
+
+
+def test_a_view_alone_does_not_tell_that_a_side_leans():
+    views = lit_on_plan(hidden_by_layers(steep_cone, 0.3), lambda x, y: steep_cone(x, y, 0.0), ONE_LOOK)
+    made = (silhouette_sides(levels_of_mask(view), view, (0.0, 0.0)) for view in views)
+    # Views every 4° of 12°: six beside.
+    sides = [replace(side, info=replace(side.info, aperture_rad=math.radians(12.0))) for side in made]
+    few = [
+        side if n % 4 == 0 else replace(side, leaning=((math.nan, math.nan),) * len(side.direction_rad))
+        for n, side in enumerate(sides)
+    ]
+    assert "leaning" in [shape for side in leaning_agreed(sides) for shape in side.shapes]
+    assert "leaning" not in [shape for side in leaning_agreed(few) for shape in side.shapes]
+    # Of a program that does not tell lines.
+    bare = [replace(side, leaning=()) for side in sides]
+    assert leaning_agreed(bare) == bare
 
 
 @pytest.mark.parametrize("radius_m", [0.02, 0.04, 0.06, 0.1])

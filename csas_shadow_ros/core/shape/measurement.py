@@ -67,7 +67,8 @@ SHAPES = ("straight", "tapering", "round", "flared", "leaning")
 _STRAIGHT, _FLARED, _LEANING = (SHAPES.index(name) for name in ("straight", "flared", "leaning"))
 #: A side leans if a line from where it is widest (within so much, resolution cells across) over one of these
 #: shares of the rows from there on is drawn in by so much (across), is so long (down-range; share of the
-#: shadow), and fits the edge to so much (across; rms, and how far its middle bulges). LEANING_FIGURES
+#: shadow), and fits the edge to so much, and this share of what it is drawn in by (across; rms, and how far
+#: its middle bulges). Half and double: docs/method.md.
 _LEAN_OPEN_CELLS, _LEAN_SHARES = 0.5, (1.0, 0.85, 0.7)
 _LEAN_CELLS, _LEAN_LONG_CELLS, _LEAN_LEAST_SHARE = 3.0, 6.0, 0.5
 _LEAN_ROUGH_CELLS, _LEAN_ROUGH_SHARE = 0.4, 0.05
@@ -101,7 +102,9 @@ _VOXEL_WEIGHT, _VOXEL_ALONE = 0.1, 1.0
 #: A side that stands out of the carved voxels by more than this (cross-range cells) belongs to something else
 #: whose shadow touches the target's.
 _FOREIGN_CELLS = 3.0
-#: A side that leans down to its foot may stand out by so many times more. LOST_FIGURES
+#: A side that leans down to its foot may stand out by so many times more: what slopes is carved away there by
+#: its own light. A wedge's thin end stands out by 8 cells. At half it stays 4 cells too short, at double
+#: nothing changes.
 _FOOT_LOST = 2.0
 #: Fewer edges than this give no plan: the voxels alone are measured then.
 MIN_EDGES = 24
@@ -122,7 +125,12 @@ _RESAMPLINGS = 20
 #: half extents are wrong by 0.8 cells (rms, 58 extents of results that are not called untrustworthy), and
 #: their intervals hold 95 % of the truths; at half 71 %, at double all of them.
 _EDGE_CELLS = 0.8
-#: Where the cap begins: the mean of these two, voxels under the cap's top.
+#: Slack under the cap's top is told in voxels, or in so much of the height that casts a cell of shadow where
+#: that is more: edges of layers are no surer, however fine the voxels. Two tables of 0.32 and 0.33 m, in
+#: voxels of a fifth of a cell, are 0.36 m high, 0.44 and 0.43 m by voxels alone; at half 0.43 and 0.40 m, at
+#: double a tyre of 0.34 m is 0.52 m (0.44). On the population, with coarser voxels, half changes nothing.
+_CAP_CELLS = 2.0
+#: Where the cap begins: the mean of these two, in that unit under the cap's top.
 _CAP_SLACK = (0.2, 0.3)
 #: A layer of which no place is so many voxels from its edge, and none a third as far as of the widest, says
 #: nothing of the cap: one voxel too many on its tip lifts where it begins by two layers (a box of 0.40 m:
@@ -770,7 +778,7 @@ class Cap:
     half_m: float
 
 
-def cap_of(grid: VoxelGrid, grazing_rad: float, hole_m: float = 0.0) -> Cap:
+def cap_of(grid: VoxelGrid, grazing_rad: float, hole_m: float = 0.0, cell_m: float = 0.0) -> Cap:
     """Find the cap that carving leaves on the top of a shape.
 
     Parameters
@@ -781,6 +789,8 @@ def cap_of(grid: VoxelGrid, grazing_rad: float, hole_m: float = 0.0) -> Cap:
         ψ: a layer of inscribed radius R carries a cap tan ψ · R high.
     hole_m : float
         Holes in a layer that are less than twice as wide are speckle, m.
+    cell_m : float
+        How high what casts a cell of shadow is, m: a layer's edge is no surer than a share of it.
 
     Notes
     -----
@@ -796,9 +806,11 @@ def cap_of(grid: VoxelGrid, grazing_rad: float, hole_m: float = 0.0) -> Cap:
     reach = faces + math.tan(grazing_rad) * (inside - 0.5) * d
     top = float(reach[inside >= min(_CAP_TIP, _CAP_TIP_SHARE * inside.max())].max())
 
+    unit = max(d, _CAP_CELLS * cell_m)
+
     def lowest(slack: float) -> float:
         # The lowest layer from which the cap alone reaches so near the top, interpolated between layers.
-        limit = top - slack * d
+        limit = top - slack * unit
         first = int(np.argmax(reach >= limit))
         below = max(first - 1, 0)
         rise = max(float(reach[first] - reach[below]), 1e-9)
@@ -806,7 +818,7 @@ def cap_of(grid: VoxelGrid, grazing_rad: float, hole_m: float = 0.0) -> Cap:
         return float(faces[below] + share * (faces[first] - faces[below]))
 
     begins = float(np.mean([lowest(slack) for slack in _CAP_SLACK]))
-    near, far = (slack * d for slack in _DOME_SLACK)
+    near, far = (slack * unit for slack in _DOME_SLACK)
     z_near, z_far = (lowest(slack) for slack in _DOME_SLACK)
     root_t = max(0.0, (z_near - z_far - (far - near)) / (2.0 * (math.sqrt(far) - math.sqrt(near))))
     dome = z_near + (root_t + math.sqrt(near)) ** 2
@@ -998,7 +1010,7 @@ def measure_object(
     aperture = float(np.median([side.info.aperture_rad for side in sides]))
     along, beside = (across * doubt_cells(*apart, plan.heading_rad + t, aperture) for t in (0.0, math.pi / 2))
     intervals = _plan_intervals(plan, resampled, edge, (along, beside))
-    cap = cap_of(grid, grazing, _HOLE_CELLS * across)
+    cap = cap_of(grid, grazing, _HOLE_CELLS * across, down * math.tan(grazing))
     sigma = math.hypot(d / 2.0, down * math.tan(grazing))
     measured = replace(
         whole,
