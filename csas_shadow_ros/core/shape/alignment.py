@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .measurement import MIN_EDGES, PlanFit, SilhouetteSides, agreed_support, leaning_agreed
+from .measurement import MIN_EDGES, PlanFit, SilhouetteSides, agreed_sides
 from .volume import VoxelGrid
 
 #: Sides that scatter about one plan by more than this (1σ, cross-range cells) may be those of views that lie
@@ -47,8 +47,7 @@ def shifts_across(sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> dict[int
         By stamp, along e_c, m. Empty where the sides are those of one plan as they are, or where shifts do
         not make them so.
     """
-    sides = leaning_agreed(sorted(sides, key=lambda side: side.info.stamp_ns))
-    told = agreed_support(sides)
+    sides, told = agreed_sides(sides)
     if not len(told):
         return {}
     view = np.array([n for n, side in enumerate(sides) for _ in side.direction_rad])

@@ -283,15 +283,16 @@ def silhouette_sides(levels: Levels, mask: View, target_m: tuple[float, float]) 
     middle = (first + last) / 2.0
     for sign, edge in ((1, last), (-1, first)):
         out_px, inner_px = (sign * (column - u0) * scale for column in (edge, middle))
-        given = levels, rows, out_px, inner_px, scale, sign, (u0, v0), info.cell_px
-        found = _side(*given)
+        own_edge = _Edge(levels, sign, (u0, v0), info.cell_px, rows, scale, out_px, inner_px)
+        calm = own_edge.calmed()
+        found = _side(own_edge, calm)
         if found is None:
             continue
         out, shape = found
         axis = sign * e_c
         directions.append(math.atan2(axis[1], axis[0]))
         here = float(axis @ np.asarray(target_m))
-        out_m, lean = _leaning(*given, (row_m, col_m)) or (math.nan, math.nan)
+        out_m, lean = _leaning(calm, (row_m, col_m)) or (math.nan, math.nan)
         axis = math.cos(lean) * axis + math.sin(lean) * down_range_axis(info.aspect_rad)
         leaning.append((math.atan2(axis[1], axis[0]), out_m + float(axis @ np.asarray(target_m))))
         beyond = {"straight": outside, "flared": outside}
@@ -325,123 +326,118 @@ def levels_of_mask(mask: View) -> Levels:
     )
 
 
-def _side(
-    levels: Levels,
-    rows: NDArray[np.intp],
-    out_px: FloatArray,
-    inner_px: FloatArray,
-    scale: FloatArray,
-    sign: int,
-    target_px: tuple[float, float],
-    cell_px: tuple[float, float],
-) -> tuple[dict[str, float], str] | None:
+@dataclass(frozen=True)
+class _Edge:
+    """One side of a silhouette, row by row.
+
+    Places are pixels outwards from the target's column, taken back to the target's range: rays fan out from
+    the sonar.
+    """
+
+    levels: Levels
+    #: 1: to the right of the target, -1: to its left.
+    sign: int
+    target_px: tuple[float, float]
+    cell_px: tuple[float, float]
+    #: Of each row: its number, what takes its columns back to the target's range, its edge, and its middle.
+    rows: NDArray[np.intp]
+    scale: FloatArray
+    out_px: FloatArray
+    inner_px: FloatArray
+
+    def calmed(self) -> _Edge:
+        """Return it by a running median: rows chosen by their own edges would be those that err outwards."""
+        size = 2 * round(_MEDIAN_HALF_CELLS * self.cell_px[0]) + 1
+        calm, inner = (
+            scipy.ndimage.median_filter(px, size, mode="nearest") for px in (self.out_px, self.inner_px)
+        )
+        return replace(self, out_px=calm, inner_px=inner)
+
+    def of_rows(self, which: NDArray[np.bool_] | slice) -> _Edge:
+        """Return some of its rows."""
+        of = {name: getattr(self, name)[which] for name in ("rows", "scale", "out_px", "inner_px")}
+        return replace(self, **of)
+
+    def beyond(self, curve_px: FloatArray) -> float:
+        """Return how far outside of a fitted curve it lies, pixels.
+
+        From the mean profile across the edge, rows laid over one another along the curve; NaN where unknown.
+        The side has the shadow from its middle outwards: what lies towards that is the other side's. A shadow
+        that is narrower than the profile would lose there what is lit behind the other edge.
+        """
+        levels, sign, u0, scale = self.levels, self.sign, self.target_px[0], self.scale
+        half = max(1, round(_PROFILE_CELLS * self.cell_px[1]))
+        steps = sign * np.arange(-half, half + 1)
+        curve = sign * curve_px
+        columns = np.round(u0 + (curve[:, None] + steps) / scale[:, None]).astype(np.intp)
+        inside = (columns >= 0) & (columns < levels.power.shape[1])
+        offsets = sign * ((columns - u0) * scale[:, None] - curve[:, None])
+        columns = np.clip(columns, 0, levels.power.shape[1] - 1)
+        known = levels.known[self.rows[:, None], columns] & inside
+        if not known.any(axis=0).all():
+            return math.nan
+        shadow_power = 1.0 / levels.contrast**2
+        own = sign * (columns - u0) * scale[:, None] >= self.inner_px[:, None]
+        powers = np.where(own, levels.power[self.rows[:, None], columns], shadow_power)
+        power = np.where(known, powers, 0.0).sum(axis=0) / known.sum(axis=0)
+        dark = np.clip((1.0 - power) / (1.0 - shadow_power), -0.5, 1.2)
+        return -half - 0.5 + float(dark.sum()) + float((offsets - sign * steps).mean())
+
+
+def _side(edge: _Edge, calm: _Edge) -> tuple[dict[str, float], str] | None:
     """Return how far out a side reaches if it is of each of `SHAPES`, and which it seems to be.
 
-    In pixels from column u0, at the target's range; None where too little of it is seen.
+    In pixels from the target's column, at the target's range; None where too little of it is seen.
     """
-    # By a running median: choosing rows by their own edges would favour those that err outwards.
-    down_px, across_px = cell_px
-    size = 2 * round(_MEDIAN_HALF_CELLS * down_px) + 1
-    calm, inner_px = (scipy.ndimage.median_filter(px, size, mode="nearest") for px in (out_px, inner_px))
-    kept = np.abs(calm - np.percentile(calm, 90)) <= _SIDE_CELLS * across_px
+    down_px, across_px = edge.cell_px
+    kept = np.abs(calm.out_px - np.percentile(calm.out_px, 90)) <= _SIDE_CELLS * across_px
     if kept.sum() < _LEAST_CELLS * down_px:
         return None
-    rows, out_px, inner_px, scale = rows[kept], out_px[kept], inner_px[kept], scale[kept]
-    u0, v0 = target_px
-    curves, shape, slope = _fitted_side(rows - rows.mean(), out_px, across_px)
+    calm = calm.of_rows(kept)
+    rows = calm.rows
+    curves, shape, slope = _fitted_side(rows - rows.mean(), edge.out_px[kept], across_px)
     # The target's echo hides the foot of a side that is drawn in upwards: its shadow would begin at the
     # target's own range.
-    hidden = min(max(0.0, float(rows[0]) - v0), float(rows[-1] - rows[0]))
+    hidden = min(max(0.0, float(rows[0]) - edge.target_px[1]), float(rows[-1] - rows[0]))
     out = dict.fromkeys(SHAPES, math.nan)
     for name, curve in curves.items():
         foot = max(0.0, -slope) * hidden if name == "tapering" else 0.0
-        beyond = _edge_beyond(levels, rows, scale, sign * curve, inner_px, sign, u0, across_px)
-        out[name] = float(curve.max()) + foot + beyond
-    near = rows < rows[0] + _FOOT_CELLS * down_px
-    foot_px = np.full(int(near.sum()), float(calm[kept][near].mean()))
-    beyond_foot = _edge_beyond(
-        levels, rows[near], scale[near], sign * foot_px, inner_px[near], sign, u0, across_px
-    )
-    out["flared"] = float(foot_px[0]) + beyond_foot
+        out[name] = float(curve.max()) + foot + calm.beyond(curve)
+    near = calm.of_rows(rows < rows[0] + _FOOT_CELLS * down_px)
+    foot_px = np.full(len(near.rows), float(near.out_px.mean()))
+    out["flared"] = float(foot_px[0]) + near.beyond(foot_px)
     return None if math.isnan(out[shape]) else (out, shape)
 
 
-def _leaning(
-    levels: Levels,
-    rows: NDArray[np.intp],
-    out_px: FloatArray,
-    inner_px: FloatArray,
-    scale: FloatArray,
-    sign: int,
-    target_px: tuple[float, float],
-    cell_px: tuple[float, float],
-    spacing_m: tuple[float, float],
-) -> tuple[float, float] | None:
+def _leaning(calm: _Edge, spacing_m: tuple[float, float]) -> tuple[float, float] | None:
     """Return how far (m) a side that leans inwards lies off the target's place, and how much it leans (rad).
 
-    None where it does not. Rays fan out from the sonar: lines stay lines as both coordinates are taken back
-    to the target's range.
+    None where it does not. Lines stay lines as both coordinates are taken back to the target's range.
     """
-    (down_px, across_px), (row_m, col_m), (u0, v0) = cell_px, spacing_m, target_px
-    size = 2 * round(_MEDIAN_HALF_CELLS * down_px) + 1
-    calm, inner_px = (scipy.ndimage.median_filter(px, size, mode="nearest") for px in (out_px, inner_px))
+    (down_px, across_px), (row_m, col_m) = calm.cell_px, spacing_m
     # The shadow opens up to where the body's own echo hides it no more. If it runs straight from there and
     # narrows later, that is the shadow of a top.
-    widest = np.flatnonzero(calm >= calm.max() - _LEAN_OPEN_CELLS * across_px)[0]
-    least = max(_LEAN_LONG_CELLS * down_px, _LEAN_LEAST_SHARE * len(rows))
-    rows, calm, inner_px, scale = rows[widest:], calm[widest:], inner_px[widest:], scale[widest:]
-    along_m = (rows - v0) * scale * row_m
+    widest = np.flatnonzero(calm.out_px >= calm.out_px.max() - _LEAN_OPEN_CELLS * across_px)[0]
+    least = max(_LEAN_LONG_CELLS * down_px, _LEAN_LEAST_SHARE * len(calm.rows))
+    lower = calm.of_rows(slice(widest, None))
     for share in _LEAN_SHARES:
-        n = math.ceil(share * len(rows))
+        n = math.ceil(share * len(lower.rows))
         if n < least:
             return None
-        along = along_m[:n] / col_m
-        slope, level = np.polyfit(along, calm[:n], 1)
+        own = lower.of_rows(slice(n))
+        along = (own.rows - own.target_px[1]) * own.scale * row_m / col_m
+        slope, level = np.polyfit(along, own.out_px, 1)
         line = level + slope * along
-        rough = float(np.sqrt(np.mean((calm[:n] - line) ** 2)))
-        bulge = abs(float(np.polyfit(along, calm[:n], 2)[0])) * float(np.ptp(along)) ** 2 / 4.0
+        rough = float(np.sqrt(np.mean((own.out_px - line) ** 2)))
+        bulge = abs(float(np.polyfit(along, own.out_px, 2)[0])) * float(np.ptp(along)) ** 2 / 4.0
         drawn_in = -float(slope) * float(np.ptp(along))
         if drawn_in < _LEAN_CELLS * across_px:
             continue
         if max(rough, bulge) > _LEAN_ROUGH_CELLS * across_px + _LEAN_ROUGH_SHARE * drawn_in:
             continue
-        beyond = _edge_beyond(levels, rows[:n], scale[:n], sign * line, inner_px[:n], sign, u0, across_px)
-        lean = math.atan(-slope)
+        beyond, lean = own.beyond(line), math.atan(-slope)
         return None if math.isnan(beyond) else (float(level + beyond) * col_m * math.cos(lean), lean)
     return None
-
-
-def _edge_beyond(
-    levels: Levels,
-    rows: NDArray[np.intp],
-    scale: FloatArray,
-    curve: FloatArray,
-    inner_px: FloatArray,
-    sign: int,
-    u0: float,
-    cell_px: float,
-) -> float:
-    """Return how far outside of a fitted side (columns from u0, at the target's range) its edge lies, pixels.
-
-    From the mean profile across the edge, rows laid over one another along the side; NaN where unknown. The
-    side has the shadow from its middle outwards, `inner_px` towards it: what lies beyond is the other side's.
-    A shadow that is narrower than the profile would lose there what is lit behind the other edge.
-    """
-    half = max(1, round(_PROFILE_CELLS * cell_px))
-    steps = sign * np.arange(-half, half + 1)
-    columns = np.round(u0 + (curve[:, None] + steps) / scale[:, None]).astype(np.intp)
-    inside = (columns >= 0) & (columns < levels.power.shape[1])
-    offsets = sign * ((columns - u0) * scale[:, None] - curve[:, None])
-    columns = np.clip(columns, 0, levels.power.shape[1] - 1)
-    known = levels.known[rows[:, None], columns] & inside
-    if not known.any(axis=0).all():
-        return math.nan
-    shadow_power = 1.0 / levels.contrast**2
-    own = sign * (columns - u0) * scale[:, None] >= inner_px[:, None]
-    powers = np.where(own, levels.power[rows[:, None], columns], shadow_power)
-    power = np.where(known, powers, 0.0).sum(axis=0) / known.sum(axis=0)
-    dark = np.clip((1.0 - power) / (1.0 - shadow_power), -0.5, 1.2)
-    return -half - 0.5 + float(dark.sum()) + float((offsets - sign * steps).mean())
 
 
 def _fitted_side(
@@ -469,6 +465,25 @@ def _fitted_side(
         if float(curves["round"].max()) - mean > _BULGE_CELLS * cell_px:
             shape = "round"
     return curves, shape, slope
+
+
+def agreed_sides(sides: Sequence[SilhouetteSides]) -> tuple[list[SilhouetteSides], FloatArray]:
+    """Return what the sides tell of the plan together.
+
+    Parameters
+    ----------
+    sides : sequence of SilhouetteSides
+        Of all views, in any order.
+
+    Returns
+    -------
+    sides : list of SilhouetteSides
+        By stamp; those that lean inwards as bounds across their own lines (`leaning_agreed`).
+    support_m : ndarray of float
+        The plan's support in the direction of each of their sides, m (`agreed_support`).
+    """
+    in_order = leaning_agreed(sorted(sides, key=lambda side: side.info.stamp_ns))
+    return in_order, agreed_support(in_order)
 
 
 def leaning_agreed(sides: Sequence[SilhouetteSides]) -> list[SilhouetteSides]:
@@ -983,8 +998,7 @@ def measure_object(
     Volume is that of the shadow hull, whose hollows no shadow shows: its interval is that of the hull.
     """
     whole = measure(mesh)
-    sides = leaning_agreed(sorted(sides, key=lambda side: side.info.stamp_ns))
-    by_shadows = agreed_support(sides)
+    sides, by_shadows = agreed_sides(sides)
     fit = PlanFit(sides, grid, by_shadows)
     if fit.count < MIN_EDGES:
         return whole
@@ -1051,8 +1065,7 @@ def _cap_height(cap: Cap, cell_m: float, tip_share: float) -> float:
 
 def sides_apart(sides: Sequence[SilhouetteSides]) -> float:
     """Return the share of a body's sides that opposite views see at different places (`opposed_sides`)."""
-    sides = leaning_agreed(sides)
-    return opposed_share(opposed_sides(sides, agreed_support(sides))[1])
+    return opposed_share(opposed_sides(*agreed_sides(sides))[1])
 
 
 def _plan_intervals(
