@@ -35,6 +35,7 @@ from csas_shadow_ros.core.shape.layover import echo_zone, opaque_part
 from csas_shadow_ros.core.shape.measurement import (
     SHAPES,
     PlanFit,
+    agreed_sides,
     cap_of,
     leaning_agreed,
     levels_of_mask,
@@ -214,11 +215,13 @@ def touched(sides, arc_deg, by_m=0.15):
 @pytest.mark.parametrize(("arc_deg", "share"), [(0.0, 0.0), (30.0, 30 / 360), (90.0, 90 / 360)])
 def test_sides_that_opposite_views_see_at_different_places_are_counted(arc_deg, share):
     sides = touched(drawn_sides(box_support(0.6, 0.4)), arc_deg)
-    assert sides_apart(sides) == pytest.approx(share, abs=0.02)
+    z, y, x = np.meshgrid(VOLUME.z_m, VOLUME.y_m, VOLUME.x_m, indexing="ij")
+    grid = grid_of((np.abs(x) < 0.3) & (np.abs(y) < 0.2) & (z < 0.2))
+    assert sides_apart(sides, grid) == pytest.approx(share, abs=0.02)
     # Of half a circle no side is seen twice.
     half = [one for one in sides if one.info.aspect_rad < math.pi - 0.3]
-    assert sides_apart(half) == 0.0
-    assert sides_apart([]) == 0.0
+    assert sides_apart(half, grid) == 0.0
+    assert sides_apart([], grid) == 0.0
 
 
 def test_an_extent_whose_sides_lie_apart_is_told_with_less_certainty():
@@ -618,6 +621,24 @@ def test_a_body_that_slopes_down_to_its_foot_is_as_long_as_the_lines_of_its_shad
     found = measure_object(grid_of(carved, volume), mesh_from_grid(grid_of(carved, volume)), sides)
     assert (found.length_m, found.width_m) == pytest.approx(sizes, abs=0.04)  # a cell and a half
     assert found.intervals["length_m"][0] < sizes[0] < found.intervals["length_m"][1]
+
+
+def tower(x, y, z):
+    """A tower 0.2 m wide and 0.4 m high on a base 0.8 by 0.4 m wide and 0.1 m high."""
+    return np.maximum(np.abs(x), 2.0 * np.abs(y)) < np.where(z < 0.1, 0.4, 0.1)
+
+
+def test_the_shadow_s_line_from_a_base_s_top_to_a_tower_s_is_no_side_that_leans():
+    """It meets the ground outside of the base: the plan was 0.46 m wide."""
+    views = lit_on_plan(hidden_by_layers(tower, 0.4), lambda x, y: tower(x, y, 0.0), ONE_LOOK)
+    sides = [side for view in views if (side := silhouette_sides(levels_of_mask(view), view, (0.0, 0.0)))]
+    assert "leaning" in [shape for side in leaning_agreed(sides) for shape in side.shapes]
+    volume = Volume.around((0.0, 0.0), (1.2, 1.2, 0.5), 0.02)
+    z, y, x = np.meshgrid(volume.z_m, volume.y_m, volume.x_m, indexing="ij")
+    grid = grid_of(tower(x, y, z) & (z < 0.4), volume)
+    assert "leaning" not in [shape for side in agreed_sides(sides, grid)[0] for shape in side.shapes]
+    found = measure_object(grid, mesh_from_grid(grid), sides)
+    assert (found.length_m, found.width_m) == pytest.approx((0.8, 0.4), abs=0.02)
 
 
 @pytest.mark.parametrize(

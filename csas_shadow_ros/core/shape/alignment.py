@@ -47,7 +47,7 @@ def shifts_across(sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> dict[int
         By stamp, along e_c, m. Empty where the sides are those of one plan as they are, or where shifts do
         not make them so.
     """
-    sides, told = agreed_sides(sides)
+    sides, told = agreed_sides(sides, grid)
     if not len(told):
         return {}
     view = np.array([n for n, side in enumerate(sides) for _ in side.direction_rad])

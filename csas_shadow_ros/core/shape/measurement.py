@@ -74,6 +74,8 @@ _LEAN_CELLS, _LEAN_LONG_CELLS, _LEAN_LEAST_SHARE = 3.0, 6.0, 0.5
 _LEAN_ROUGH_CELLS, _LEAN_ROUGH_SHARE = 0.4, 0.05
 #: And if more than this share of the sides see it so that views so far to either side show (apertures).
 _LEAN_VOTES, _LEAN_BESIDE = 1.0 / 3.0, 1.0
+#: And if the lines bound one plan with the other sides: they scatter about it by less (across, rms).
+_LEAN_SCATTER_CELLS = 0.5
 #: A foot is so long (resolution cells down-range), and stands out if the views beside agree on more than this
 #: (across).
 _FOOT_CELLS, _FLARE_CELLS = 14.4, 0.375
@@ -467,13 +469,17 @@ def _fitted_side(
     return curves, shape, slope
 
 
-def agreed_sides(sides: Sequence[SilhouetteSides]) -> tuple[list[SilhouetteSides], FloatArray]:
+def agreed_sides(
+    sides: Sequence[SilhouetteSides], grid: VoxelGrid
+) -> tuple[list[SilhouetteSides], FloatArray]:
     """Return what the sides tell of the plan together.
 
     Parameters
     ----------
     sides : sequence of SilhouetteSides
         Of all views, in any order.
+    grid : VoxelGrid
+        What was carved of them.
 
     Returns
     -------
@@ -481,9 +487,30 @@ def agreed_sides(sides: Sequence[SilhouetteSides]) -> tuple[list[SilhouetteSides
         By stamp; those that lean inwards as bounds across their own lines (`leaning_agreed`).
     support_m : ndarray of float
         The plan's support in the direction of each of their sides, m (`agreed_support`).
+
+    Notes
+    -----
+    A line bounds the plan where it meets the ground. The upper edge of a wall, or of a body that stands on a
+    wider one, casts such a line from its own height: it passes outside of the plan, the farther the more it
+    leans. Then the lines and the other sides bound no one plan (`_LEAN_SCATTER_CELLS`), and no side leans.
     """
-    in_order = leaning_agreed(sorted(sides, key=lambda side: side.info.stamp_ns))
-    return in_order, agreed_support(in_order)
+    in_order = sorted(sides, key=lambda side: side.info.stamp_ns)
+    leaning = leaning_agreed(in_order)
+    if not _bound_one_plan(leaning, grid):
+        leaning = in_order
+    return leaning, agreed_support(leaning)
+
+
+def _bound_one_plan(sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> bool:
+    """Say whether the sides that lean, if any, bound one plan with the others."""
+    leans = np.array([shape == SHAPES[_LEANING] for side in sides for shape in side.shapes], np.bool_)
+    if not leans.any():
+        return True
+    fit = PlanFit(sides, grid)
+    fit.solve()
+    beyond = fit.beyond_m[leans[fit.kept]]
+    cell = float(np.median([side.info.resolution_m[1] for side in sides]))
+    return bool(len(beyond)) and math.sqrt(float(np.mean(beyond**2))) <= _LEAN_SCATTER_CELLS * cell
 
 
 def leaning_agreed(sides: Sequence[SilhouetteSides]) -> list[SilhouetteSides]:
@@ -998,7 +1025,7 @@ def measure_object(
     Volume is that of the shadow hull, whose hollows no shadow shows: its interval is that of the hull.
     """
     whole = measure(mesh)
-    sides, by_shadows = agreed_sides(sides)
+    sides, by_shadows = agreed_sides(sides, grid)
     fit = PlanFit(sides, grid, by_shadows)
     if fit.count < MIN_EDGES:
         return whole
@@ -1063,9 +1090,9 @@ def _cap_height(cap: Cap, cell_m: float, tip_share: float) -> float:
     return 0.5 * (cap.begins_m + cap.dome_m) + tip
 
 
-def sides_apart(sides: Sequence[SilhouetteSides]) -> float:
+def sides_apart(sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> float:
     """Return the share of a body's sides that opposite views see at different places (`opposed_sides`)."""
-    return opposed_share(opposed_sides(*agreed_sides(sides))[1])
+    return opposed_share(opposed_sides(*agreed_sides(sides, grid))[1])
 
 
 def _plan_intervals(

@@ -246,7 +246,8 @@ def _fit_of(result: Result, reasons: list[str]) -> int:
             " together by the sides of their shadows: check the navigation"
         )
         worst = max(worst, 1)
-    apart = sides_apart(result.sides) if result.dimensions is not None and result.sides else 0.0
+    grid = result.grid if result.dimensions is not None else None
+    apart = sides_apart(result.sides, grid) if grid is not None and result.sides else 0.0
     if apart > _MOST_APART:
         reasons.append(
             f"opposite views see {100.0 * apart:.0f} % of the sides at different places: another shadow"
