@@ -38,6 +38,7 @@ from .contour import Contour, contour_height, contour_of
 from .echo_sides import echo_reach_px
 from .mesh import Dimensions, digits_of, measure
 from .opposed import doubt_cells, opposed_share, opposed_sides
+from .rectangle import Rectangle, SupportSamples, fitted_rectangle, is_rectangle
 from .seabed import largest_piece, leaves_image
 from .volume import VoxelGrid
 
@@ -681,7 +682,10 @@ class PlanFit:
             alone &= ~leans[away.argmin(axis=1)]  # for the same reason
         weights = np.where(alone, _VOXEL_ALONE, _VOXEL_WEIGHT)
         self._weights = np.concatenate([np.ones(self.count), weights])
+        # Five numbers need no voxels beside sides.
+        self._tells_rectangle = np.concatenate([np.ones(self.count, np.bool_), alone])
         self._robust = np.ones_like(self._weights)
+        self._is_rectangle = False
         self.spread_m = 0.0
         self.beyond_m = np.zeros(self.count)
         self.counts = np.ones(self.count, np.bool_)
@@ -735,11 +739,31 @@ class PlanFit:
         self.counts = self._robust[: self.count] > 0.0
         return np.asarray(self._basis(self.directions) @ solution)
 
-    def resampled(self, share: FloatArray) -> FloatArray:
-        """Return h as `solve` does, each side counting `share` times, shape (count,)."""
+    def plan(self, support: FloatArray) -> Rectangle:
+        """Return the smallest rectangle round the plan, or the plan itself where it is a rectangle.
+
+        Parameters
+        ----------
+        support : ndarray of float, shape (720,)
+            What `solve` returned.
+        """
+        smallest = _rectangle(support, self.centre)
+        samples = self._samples(self._weights * self._robust)
+        self._is_rectangle = is_rectangle(samples, smallest, samples.scatter_m(self.beyond_m))
+        return fitted_rectangle(samples, smallest) if self._is_rectangle else smallest
+
+    def resampled(self, share: FloatArray, plan: Rectangle) -> Rectangle:
+        """Return the plan as `plan` does, each side counting `share` times, shape (count,)."""
         weights = self._weights * self._robust
         weights[: self.count] *= np.sqrt(share)
-        return np.asarray(self._basis(self.directions) @ self._solve(weights))
+        if self._is_rectangle:
+            return fitted_rectangle(self._samples(weights), plan)
+        return _rectangle(self._basis(self.directions) @ self._solve(weights), self.centre)
+
+    def _samples(self, weights: FloatArray) -> SupportSamples:
+        about = self.centre[0] * np.cos(self._phi) + self.centre[1] * np.sin(self._phi)
+        weights = weights * self._tells_rectangle
+        return SupportSamples(self._phi, self._aperture, self._values + about, weights, self.count)
 
 
 def _round_circle(count: int) -> FloatArray:
@@ -770,15 +794,7 @@ def _without_thin_parts(grid: VoxelGrid, width_m: float) -> VoxelGrid:
     return replace(grid, occupied=grid.occupied & kept) if kept.any() else grid
 
 
-@dataclass(frozen=True)
-class _Rectangle:
-    length_m: float
-    width_m: float
-    heading_rad: float
-    position_m: tuple[float, float]
-
-
-def _rectangle(support: FloatArray, centre: FloatArray) -> _Rectangle:
+def _rectangle(support: FloatArray, centre: FloatArray) -> Rectangle:
     """Return the smallest rectangle round a plan with that support."""
     h, m = support, len(support)
     angles = _round_circle(m)
@@ -793,7 +809,7 @@ def _rectangle(support: FloatArray, centre: FloatArray) -> _Rectangle:
     for k in (a, b):
         off = (h[k] - h[(k + m // 2) % m]) / 2.0
         middle += off * np.array([math.cos(angles[k]), math.sin(angles[k])])
-    return _Rectangle(
+    return Rectangle(
         float(widths[a]), float(widths[b]), float(angles[a] % math.pi), (float(middle[0]), float(middle[1]))
     )
 
@@ -1037,9 +1053,9 @@ def measure_object(
     if (by_echoes != by_shadows).any():
         fit = PlanFit(sides, grid, by_echoes)
         support = fit.solve()
-    plan = _rectangle(support, fit.centre)
+    plan = fit.plan(support)
     grazing = float(np.median([side.info.camera.grazing_rad for side in sides]))
-    resampled = _resampled(fit, sides, seed)
+    resampled = _resampled(fit, plan, sides, seed)
     down, across = (float(np.median([s.info.resolution_m[axis] for s in sides])) for axis in (0, 1))
     edge = _EDGE_CELLS * across
     d = grid.volume.voxel_size_m
@@ -1096,7 +1112,7 @@ def sides_apart(sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> float:
 
 
 def _plan_intervals(
-    plan: _Rectangle, resampled: Sequence[_Rectangle], edge_m: float, doubt_m: tuple[float, float]
+    plan: Rectangle, resampled: Sequence[Rectangle], edge_m: float, doubt_m: tuple[float, float]
 ) -> dict[str, tuple[float, float]]:
     """Return the 95 % intervals of a plan by its resamplings, an edge's error, and what views see apart."""
     intervals = {}
@@ -1148,7 +1164,9 @@ def doubted(found: Dimensions, share: float) -> Dimensions:
     return replace(found, intervals=intervals)
 
 
-def _resampled(fit: PlanFit, sides: Sequence[SilhouetteSides], seed: int) -> list[_Rectangle]:
+def _resampled(
+    fit: PlanFit, plan: Rectangle, sides: Sequence[SilhouetteSides], seed: int
+) -> list[Rectangle]:
     """Fit the plan to views drawn again and again, in blocks of an aperture."""
     rng = np.random.default_rng(seed)
     aperture = max(float(np.median([s.info.aperture_rad for s in sides])), 1e-3)
@@ -1158,7 +1176,7 @@ def _resampled(fit: PlanFit, sides: Sequence[SilhouetteSides], seed: int) -> lis
     for _ in range(_RESAMPLINGS):
         drawn = np.bincount(rng.integers(0, len(names), len(names)), minlength=len(names))
         share = drawn[block][fit.view_of].astype(np.float64)
-        out.append(_rectangle(fit.resampled(share), fit.centre))
+        out.append(fit.resampled(share, plan))
     return out
 
 
