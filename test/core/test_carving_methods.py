@@ -12,6 +12,7 @@ import pytest
 from csas_shadow_ros.core.errors import CsasError
 from csas_shadow_ros.core.methods import METHODS, Method, method_named
 from csas_shadow_ros.core.parameters import CarvingParameters
+from csas_shadow_ros.core.shape.carving import Carver, part_around
 from csas_shadow_ros.core.shape.threshold import (
     needed_threshold,
     object_threshold,
@@ -77,3 +78,21 @@ def test_no_other_file_of_the_method_tells_methods_apart_by_name():
     told = re.compile(r"""method\s*(==|!=|in)\s*\(?["']""")
     for path in sorted((ROOT / "csas_shadow_ros").rglob("*.py")):
         assert not told.search(path.read_text(encoding="utf-8")), path
+
+
+def test_a_part_of_a_volume_is_carved_as_in_the_whole():
+    """The views that know the best known voxel count, wherever that lies: a part alone held no object."""
+    volume = Volume.around((0.0, 0.0), (1.2, 1.2, 0.6), 0.1)
+    carver = Carver(volume, CarvingParameters())
+    carver.stamps = set(range(60))
+    counts, likelihood = np.full(volume.shape, 28, np.uint16), np.ones(volume.shape, np.float32)
+    counts[:, 0, 0] = 60  # a corner that all views know
+    counts[2, 4:8, 4:8], likelihood[2, 4:8, 4:8] = 40, 0.0
+    carver._sums._count[:], carver._sums._total[:] = counts, np.rint(counts * likelihood * 4096)
+    whole = carver.first_look()
+    assert whole.occupied.sum() == 3 * 16, "what fewer than half of them know is open below a body"
+    box, part = part_around(whole.occupied, volume, 1)
+    near = carver._in_part(box, part)
+    assert counts[box].max() == 40
+    assert (near.first_look().occupied == whole.occupied[box]).all()
+    assert (near.leaner().first_look().occupied == whole.occupied[box]).all()

@@ -573,6 +573,8 @@ class Carver:
         self._fits: dict[tuple[tuple[VoxelGrid, ...], int], dict[int, ShadowFit]] = {}
         #: Stamps of the views that have been integrated.
         self.stamps: set[int] = set()
+        #: Of a part of a volume: so many views know some voxel of the whole.
+        self._most_views = 0
 
     @property
     def keeps_masks(self) -> bool:
@@ -695,6 +697,7 @@ class Carver:
         """Carve the same views again, their masks changed: only what these changes change is looked up."""
         again = Carver(self.volume, self.parameters, pool=self._pool)
         again._sums = self._sums.part((slice(None),) * 3, self.volume)
+        again._most_views = self._most_views
 
         def changed(item: tuple[int, KeptMask]) -> tuple[KeptMask, NDArray[np.uint8], NDArray[np.uint8]]:
             after = change(item[1])
@@ -739,6 +742,7 @@ class Carver:
         carver = Carver(part, self.parameters, pool=self._pool)
         carver._sums = self._sums.part(box, part)
         carver._masks, carver.stamps = self._masks, self.stamps
+        carver._most_views = int(self._sums.count.max(initial=self._most_views))
         return carver
 
     def leaner(self) -> Carver:
@@ -764,7 +768,7 @@ class Carver:
         for k in range(len(keep) - 2, -1, -1):  # what is asked for stands on all of the fuller body
             keep[k] |= keep[k + 1] & fuller.occupied[k]
         likelihood = np.where(keep, fuller.likelihood, np.fmax(leaner.likelihood, fuller.likelihood))
-        return thresholded(self.volume, likelihood, fuller.views, self.parameters)
+        return self._thresholded(likelihood, fuller.views)
 
     def given_back(self, body: VoxelGrid, others: Sequence[VoxelGrid] = ()) -> VoxelGrid:
         """Give back to a body what only lit pixels on its own plan took from it, where these speak for that.
@@ -796,7 +800,7 @@ class Carver:
             return told
         # What is lit there is the body's own top: no view contradicts.
         free = np.where(occupied & ~told.occupied, np.float32(0.0), told.likelihood)
-        return replace(thresholded(self.volume, free, told.views, self.parameters), seabed=slope)
+        return replace(self._thresholded(free, told.views), seabed=slope)
 
     def _on_own_plan(self, body: VoxelGrid, others: Sequence[VoxelGrid]) -> VoxelGrid:
         """Give back what lit pixels on the body's own plan took, where they speak for its own echo.
@@ -978,7 +982,7 @@ class Carver:
         """Add some voxels of another body to one, on a plan that all views bound."""
         likelihood = np.where(voxels, other.likelihood, body.likelihood)
         views = np.where(voxels, np.uint16(len(self.stamps)), body.views)
-        return replace(thresholded(self.volume, likelihood, views, self.parameters), seabed=body.seabed)
+        return replace(self._thresholded(likelihood, views), seabed=body.seabed)
 
     def shadow_fits(self, grids: Sequence[VoxelGrid]) -> dict[int, ShadowFit]:
         """Compare the carving silhouettes with bodies' shadows, its own body's first, by stamp.
@@ -992,9 +996,12 @@ class Carver:
             self._fits[asked] = compared_shadows(self._masks, grids)
         return self._fits[asked]
 
+    def _thresholded(self, likelihood: NDArray[np.float32], views: NDArray[np.uint16]) -> VoxelGrid:
+        return thresholded(self.volume, likelihood, views, self.parameters, self._most_views)
+
     def first_look(self) -> VoxelGrid:
         """Threshold the voxels carved so far, with covered pixels unknown: the start of `grid`."""
-        return thresholded(self.volume, self.likelihood(), self._sums.count, self.parameters)
+        return self._thresholded(self.likelihood(), self._sums.count)
 
     def beside(self, leaner: VoxelGrid, others: Sequence[VoxelGrid]) -> VoxelGrid:
         """Add to `grid` the voxels that shadows require once the other bodies are known.
@@ -1044,7 +1051,7 @@ class Carver:
         likelihood, views = first.likelihood.copy(), first.views.copy()
         likelihood[box] = _mean(sums.total, sums.count, self.parameters, len(self.stamps))
         views[box] = sums.count
-        return thresholded(self.volume, likelihood, views, self.parameters)
+        return self._thresholded(likelihood, views)
 
 
 def compared_shadows(masks: Mapping[int, KeptMask], grids: Sequence[VoxelGrid]) -> dict[int, ShadowFit]:

@@ -128,15 +128,16 @@ def occupied_voxels(
 
 
 def well_seen_voxels(
-    views: NDArray[np.uint16], method: str, min_views_fraction: float
+    views: NDArray[np.uint16], method: str, min_views_fraction: float, most_views: int = 0
 ) -> NDArray[np.bool_] | None:
     """Return the voxels that enough views know to be object by themselves.
 
+    Enough are a fraction of those that know the best known voxel, of a whole volume also in a part of it.
     None if a voxel that fewer know is unknown anyway, as it is unless few views may say that it is free.
     """
     if method_named(method).least_views >= 1.0:
         return None
-    return views >= max(1, math.ceil(min_views_fraction * int(views.max(initial=0))))
+    return views >= max(1, math.ceil(min_views_fraction * int(views.max(initial=most_views))))
 
 
 def thresholded(
@@ -144,6 +145,7 @@ def thresholded(
     likelihood: NDArray[np.float32],
     views: NDArray[np.uint16],
     parameters: CarvingParameters,
+    most_views: int = 0,
 ) -> VoxelGrid:
     """Make the grid of carved likelihoods, by the given or the automatic threshold.
 
@@ -157,10 +159,12 @@ def thresholded(
         How many views know something of each voxel.
     parameters : CarvingParameters
         Method and threshold.
+    most_views : int
+        So many views know some voxel of a larger volume that this one is a part of.
     """
     method = parameters.method
     threshold = parameters.threshold or object_threshold(likelihood, method)
-    well_seen = well_seen_voxels(views, method, parameters.min_views_fraction)
+    well_seen = well_seen_voxels(views, method, parameters.min_views_fraction, most_views)
     occupied = occupied_voxels(likelihood, threshold, method, well_seen)
     return VoxelGrid(volume, likelihood, views, threshold, occupied, method)
 
