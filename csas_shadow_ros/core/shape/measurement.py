@@ -686,6 +686,8 @@ class PlanFit:
         self._tells_rectangle = np.concatenate([np.ones(self.count, np.bool_), alone])
         self._robust = np.ones_like(self._weights)
         self._is_rectangle = False
+        #: The smallest rectangle round the convex plan that fits best, once `plan` was asked for.
+        self.smallest: Rectangle | None = None
         self.spread_m = 0.0
         self.beyond_m = np.zeros(self.count)
         self.counts = np.ones(self.count, np.bool_)
@@ -747,7 +749,7 @@ class PlanFit:
         support : ndarray of float, shape (720,)
             What `solve` returned.
         """
-        smallest = _rectangle(support, self.centre)
+        smallest = self.smallest = _rectangle(support, self.centre)
         samples = self._samples(self._weights * self._robust)
         self._is_rectangle = is_rectangle(samples, smallest, samples.scatter_m(self.beyond_m))
         return fitted_rectangle(samples, smallest) if self._is_rectangle else smallest
@@ -1066,7 +1068,7 @@ def measure_object(
         plan = _rectangle(_voxel_support(solid, fit.directions), np.zeros(2))
     aperture = float(np.median([side.info.aperture_rad for side in sides]))
     along, beside = (across * doubt_cells(*apart, plan.heading_rad + t, aperture) for t in (0.0, math.pi / 2))
-    intervals = _plan_intervals(plan, resampled, edge, (along, beside))
+    intervals = _plan_intervals(plan, fit.smallest or plan, resampled, edge, (along, beside))
     cap = cap_of(grid, grazing, _HOLE_CELLS * across, down * math.tan(grazing))
     sigma = math.hypot(d / 2.0, down * math.tan(grazing))
     measured = replace(
@@ -1112,14 +1114,22 @@ def sides_apart(sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> float:
 
 
 def _plan_intervals(
-    plan: Rectangle, resampled: Sequence[Rectangle], edge_m: float, doubt_m: tuple[float, float]
+    plan: Rectangle,
+    smallest: Rectangle,
+    resampled: Sequence[Rectangle],
+    edge_m: float,
+    doubt_m: tuple[float, float],
 ) -> dict[str, tuple[float, float]]:
-    """Return the 95 % intervals of a plan by its resamplings, an edge's error, and what views see apart."""
+    """Return the 95 % intervals of a plan by its resamplings, an edge's error, and what views see apart.
+
+    And by how far it is from the smallest rectangle round the best convex plan: which of the two is right is
+    not known.
+    """
     intervals = {}
     for name, doubt in zip(("length_m", "width_m"), doubt_m, strict=True):
         value = getattr(plan, name)
         sigma = math.hypot(float(np.std([getattr(r, name) for r in resampled])), edge_m)
-        half = math.hypot(_SIGMAS_95 * sigma, doubt)
+        half = math.hypot(_SIGMAS_95 * sigma, doubt, value - getattr(smallest, name))
         intervals[name] = (max(0.0, value - half), value + half)
     for axis, name in enumerate(("position_x_m", "position_y_m")):
         sigma = math.hypot(float(np.std([r.position_m[axis] for r in resampled])), edge_m / 2.0)
