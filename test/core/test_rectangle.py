@@ -92,5 +92,5 @@ def test_a_plan_is_a_rectangle_only_where_sides_tell_one(monkeypatch, support, i
     monkeypatch.setattr(measurement, "is_rectangle", lambda *given: told.append(ask(*given)) or told[-1])
     for seed in range(4):
         fit = PlanFit(noisy(support, seed), grid_of_plan(support))
-        fit.plan(fit.solve())
+        fit.plan(measurement._rectangle(fit.solve(), fit.centre))
     assert told == [is_one] * 4

@@ -38,7 +38,7 @@ from .contour import Contour, contour_height, contour_of
 from .echo_sides import echo_reach_px
 from .mesh import Dimensions, digits_of, measure
 from .opposed import doubt_cells, opposed_share, opposed_sides
-from .rectangle import Rectangle, SupportSamples, fitted_rectangle, is_rectangle
+from .rectangle import Rectangle, SupportSamples, fitted_rectangle, is_rectangle, looks_over
 from .seabed import largest_piece, leaves_image
 from .volume import VoxelGrid
 
@@ -82,8 +82,8 @@ _LEAN_SCATTER_CELLS = 0.5
 _FOOT_CELLS, _FLARE_CELLS = 14.4, 0.375
 #: What all sides are counts so much of what the sides beside are.
 _ALL_SIDES = 1.0
-#: Directions that a plan's sides may face, and looks over an aperture.
-_DIRECTIONS, _LOOKS = 120, 9
+#: Directions that a plan's sides may face.
+_DIRECTIONS = 120
 #: A side that holds this share of the outline gets finer directions round it: so many, so far apart (rad).
 _FLAT_SHARE, _FINE, _FINE_STEP_RAD = 0.08, 4, math.radians(0.5)
 #: Directions that the smallest rectangle is looked for among.
@@ -504,7 +504,7 @@ def agreed_sides(
 
 def _bound_one_plan(sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> bool:
     """Say whether the sides that lean, if any, bound one plan with the others."""
-    leans = np.array([shape == SHAPES[_LEANING] for side in sides for shape in side.shapes], np.bool_)
+    leans = _leans(sides)
     if not leans.any():
         return True
     fit = PlanFit(sides, grid)
@@ -512,6 +512,12 @@ def _bound_one_plan(sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> bool:
     beyond = fit.beyond_m[leans[fit.kept]]
     cell = float(np.median([side.info.resolution_m[1] for side in sides]))
     return bool(len(beyond)) and math.sqrt(float(np.mean(beyond**2))) <= _LEAN_SCATTER_CELLS * cell
+
+
+def _leans(sides: Sequence[SilhouetteSides]) -> NDArray[np.bool_]:
+    """Say which sides lean inwards; none of a program that does not tell shapes."""
+    told = (side.shapes or ("",) * len(side.direction_rad) for side in sides)
+    return np.array([shape == SHAPES[_LEANING] for shapes in told for shape in shapes], np.bool_)
 
 
 def leaning_agreed(sides: Sequence[SilhouetteSides]) -> list[SilhouetteSides]:
@@ -660,9 +666,7 @@ class PlanFit:
         coarse = _round_circle(_DIRECTIONS)
         own = _voxel_support(grid, coarse)
         self.kept = np.ones(len(seen), np.bool_)
-        leans = np.array([shape == SHAPES[_LEANING] for side in sides for shape in side.shapes], np.bool_)
-        if len(leans) != len(seen):
-            leans = np.zeros(len(seen), np.bool_)
+        leans = _leans(sides)
         if len(seen):
             cell = float(np.median([side.info.resolution_m[1] for side in sides]))
             margin = _FOREIGN_CELLS * cell + grid.volume.voxel_size_m
@@ -686,8 +690,6 @@ class PlanFit:
         self._tells_rectangle = np.concatenate([np.ones(self.count, np.bool_), alone])
         self._robust = np.ones_like(self._weights)
         self._is_rectangle = False
-        #: The smallest rectangle round the convex plan that fits best, once `plan` was asked for.
-        self.smallest: Rectangle | None = None
         self.spread_m = 0.0
         self.beyond_m = np.zeros(self.count)
         self.counts = np.ones(self.count, np.bool_)
@@ -701,8 +703,8 @@ class PlanFit:
     def _face(self, faces: FloatArray) -> None:
         """Let the outline's sides face these directions."""
         self._faces = faces
-        looks = (np.arange(_LOOKS) + 0.5) / _LOOKS - 0.5
-        self._design = np.mean([self._basis(self._phi + look * self._aperture) for look in looks], axis=0)
+        looks = looks_over(self._phi, self._aperture).T
+        self._design = np.mean([self._basis(look) for look in looks], axis=0)
         # Σρ cos = Σρ sin = 0: the outline closes.
         self._closing = np.zeros((2, self._design.shape[1]))
         self._closing[0, : len(faces)] = 10.0 * np.cos(faces)
@@ -741,15 +743,14 @@ class PlanFit:
         self.counts = self._robust[: self.count] > 0.0
         return np.asarray(self._basis(self.directions) @ solution)
 
-    def plan(self, support: FloatArray) -> Rectangle:
-        """Return the smallest rectangle round the plan, or the plan itself where it is a rectangle.
+    def plan(self, smallest: Rectangle) -> Rectangle:
+        """Return the plan's own rectangle where it is one, else the smallest one round it.
 
         Parameters
         ----------
-        support : ndarray of float, shape (720,)
-            What `solve` returned.
+        smallest : Rectangle
+            The latter, by what `solve` returned.
         """
-        smallest = self.smallest = _rectangle(support, self.centre)
         samples = self._samples(self._weights * self._robust)
         self._is_rectangle = is_rectangle(samples, smallest, samples.scatter_m(self.beyond_m))
         return fitted_rectangle(samples, smallest) if self._is_rectangle else smallest
@@ -1055,7 +1056,8 @@ def measure_object(
     if (by_echoes != by_shadows).any():
         fit = PlanFit(sides, grid, by_echoes)
         support = fit.solve()
-    plan = fit.plan(support)
+    smallest = _rectangle(support, fit.centre)
+    plan = fit.plan(smallest)
     grazing = float(np.median([side.info.camera.grazing_rad for side in sides]))
     resampled = _resampled(fit, plan, sides, seed)
     down, across = (float(np.median([s.info.resolution_m[axis] for s in sides])) for axis in (0, 1))
@@ -1068,7 +1070,7 @@ def measure_object(
         plan = _rectangle(_voxel_support(solid, fit.directions), np.zeros(2))
     aperture = float(np.median([side.info.aperture_rad for side in sides]))
     along, beside = (across * doubt_cells(*apart, plan.heading_rad + t, aperture) for t in (0.0, math.pi / 2))
-    intervals = _plan_intervals(plan, fit.smallest or plan, resampled, edge, (along, beside))
+    intervals = _plan_intervals(plan, smallest, resampled, edge, (along, beside))
     cap = cap_of(grid, grazing, _HOLE_CELLS * across, down * math.tan(grazing))
     sigma = math.hypot(d / 2.0, down * math.tan(grazing))
     measured = replace(

@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 
 #: A rectangle tells the sides as well as any convex plan if they scatter about it by so many times as much at
 #: most (rms), and better than an ellipse if they scatter about that by so many times as much: nothing
-#: that is round and a few cells wide is a box. Half and double of what either exceeds 1 by: docs/method.md.
+#: that is round and a few cells wide is a box. What other limits change: docs/method.md.
 _AS_WELL, _BETTER = 1.4, 1.1
 #: Looks over an aperture.
 _LOOKS = 9
@@ -77,6 +77,12 @@ class SupportSamples:
         return math.sqrt(float((weight * beyond_m[: self.sides] ** 2).sum() / max(weight.sum(), 1e-12)))
 
 
+def looks_over(direction_rad: FloatArray, aperture_rad: FloatArray) -> FloatArray:
+    """Return the directions of looks spread over an aperture about each direction, shape (n, looks)."""
+    looks = (np.arange(_LOOKS) + 0.5) / _LOOKS - 0.5
+    return np.asarray(direction_rad[:, None] + looks * aperture_rad[:, None])
+
+
 def _box(angle: FloatArray, along: float, across: float) -> FloatArray:
     return 0.5 * (along * np.abs(np.cos(angle)) + across * np.abs(np.sin(angle)))
 
@@ -95,8 +101,7 @@ def _fitted(
 
     Return the smallest rectangle round it, and how far the sides scatter about it, m.
     """
-    looks = (np.arange(_LOOKS) + 0.5) / _LOOKS - 0.5
-    angles = samples.direction_rad[:, None] + looks * samples.aperture_rad[:, None]
+    angles = looks_over(samples.direction_rad, samples.aperture_rad)
     east, north = np.cos(angles).mean(axis=1), np.sin(angles).mean(axis=1)
 
     def beyond(x: FloatArray) -> FloatArray:
@@ -154,4 +159,4 @@ def fitted_rectangle(samples: SupportSamples, start: Rectangle) -> Rectangle:
     return _fitted(_box, samples, start, (0.0,))[0]
 
 
-__all__ = ["Rectangle", "SupportSamples", "fitted_rectangle", "is_rectangle"]
+__all__ = ["Rectangle", "SupportSamples", "fitted_rectangle", "is_rectangle", "looks_over"]
