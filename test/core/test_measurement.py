@@ -31,7 +31,7 @@ from csas_shadow_ros.core.shape.carving import (
     Carver,
     carve,
 )
-from csas_shadow_ros.core.shape.layover import echo_zone, opaque_part
+from csas_shadow_ros.core.shape.layover import echo_zones, opaque_part
 from csas_shadow_ros.core.shape.measurement import (
     SHAPES,
     PlanFit,
@@ -513,7 +513,7 @@ def test_the_echo_of_a_box_lies_over_its_front_and_its_top_and_nowhere_behind():
     z, y, x = np.meshgrid(volume.z_m, volume.y_m, volume.x_m, indexing="ij")
     body = (np.abs(x) < 0.2) & (np.abs(y) < 0.2) & (z < 0.3)
     info = INFOS[0]  # the sonar is towards +x
-    zone = echo_zone(info, volume, body, opaque_part(body, GRAZING))
+    (zone,) = echo_zones(info, volume, body, opaque_part(body, GRAZING))
     gx, gy = ground_of_pixels(info.camera)
     lay = 0.3 * math.tan(GRAZING)
     assert zone[(gx > 0.2) & (gx < 0.2 + lay) & (np.abs(gy) < 0.18)].all()  # the front, laid over
@@ -530,8 +530,8 @@ def test_a_cap_that_shadows_cannot_tell_from_a_flat_top_hides_nothing():
     flat = (inside > 0) & (z < 0.2)
     capped = (inside > 0) & (z < 0.2 + math.tan(GRAZING) * np.maximum(inside, 0))
     info = INFOS[7]
-    of_flat = echo_zone(info, volume, flat, opaque_part(flat, GRAZING))
-    of_capped = echo_zone(info, volume, capped, opaque_part(capped, GRAZING))
+    (of_flat,) = echo_zones(info, volume, flat, opaque_part(flat, GRAZING))
+    (of_capped,) = echo_zones(info, volume, capped, opaque_part(capped, GRAZING))
     assert (of_flat & ~of_capped).sum() < 0.02 * of_flat.sum()
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from core_data import COARSE_SONAR, hidden_by_box, iou, make_info, perfect_views
 
 from csas_shadow_ros.core.geometry import View, unit_to_sonar
@@ -41,10 +42,16 @@ def table():
     return join_bodies([*legs, brick((2.0, 1.2, 0.2), (0.0, 0.0, 0.8))])
 
 
-def carved(mesh, monkeypatch):
+def carved(mesh, monkeypatch, echo_db=6.0, seed=3):
     """Return the grid of a simulated body, the one that nothing was given back to, and its shadow hull."""
     simulated = simulate(
-        COARSE_SONAR, mesh, seed=3, heading_deg=25.0, faults=Faults(contrast_db=15.0), echo_db=6.0, workers=1
+        COARSE_SONAR,
+        mesh,
+        seed=seed,
+        heading_deg=25.0,
+        faults=Faults(contrast_db=15.0),
+        echo_db=echo_db,
+        workers=1,
     )
     bare = []
     given_back = Carver.given_back
@@ -87,6 +94,18 @@ def test_a_table_is_no_block_and_a_slab_under_it_no_ring(slab, sizes_m, least):
         low, high = found.dimensions.intervals[name]
         assert low < true_m < high
         assert getattr(found.dimensions, name) == pytest.approx(true_m, abs=max(0.02, 0.05 * true_m))
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_seabed_is_seen_under_a_sphere_beside_a_strong_echo(seed, monkeypatch):
+    """All that lies within reach of an echo's sidelobes counted as echo: spheres stood on pillars."""
+    sphere = trimesh.creation.icosphere(3, 1.0)
+    sphere.apply_translation((0.0, 0.0, 1.0))
+    grid, _, hull = carved(sphere, monkeypatch, echo_db=15.0, seed=seed)
+    assert iou(grid.occupied, hull) > 0.79
+    # At a tenth of its height a sphere covers 0.36 of what it covers at its equator.
+    foot = grid.occupied[int(0.2 / VOXEL_M)]
+    assert foot.sum() < 0.75 * grid.occupied.sum(axis=(1, 2)).max()
 
 
 @pytest.mark.parametrize("size_m", [(2.0, 1.8, 0.4), (1.6, 1.5, 0.3)])
