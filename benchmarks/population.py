@@ -6,6 +6,9 @@ half is run once, at the end of a change, and nobody looks into it while working
 
     python benchmarks/population.py --half development --scenes 40 --workers 2 --out FOLDER
 
+``--half validation`` draws from families that neither half has: what was chosen on the development half is
+tried on these before the test half is run.
+
 Every scene goes through the whole automatic chain with default parameters, as ``csas-shadow run`` takes it;
 only what a user sets by the sonar (voxel) or by the time there is (aspect step) is set. FOLDER/scenes.jsonl
 takes a line as each scene is done, and a run that was interrupted goes on. The images are small, 448 to 1408

@@ -29,7 +29,9 @@ from csas_shadow_ros.simulation.bodies import (
 from csas_shadow_ros.simulation.targets import empty_mesh, join_bodies
 
 DEVELOPMENT, TEST = "development", "test"
-HALVES = (DEVELOPMENT, TEST)
+#: A third set, of families that neither half has: what the development half chose is tried here first.
+VALIDATION = "validation"
+HALVES = (DEVELOPMENT, TEST, VALIDATION)
 #: Changes with what `draw` draws: rows of another one are of other scenes.
 DRAWING = 2
 #: Views every 6°, half an aperture: time goes with their number.
@@ -233,6 +235,78 @@ def _channel(rng: Rng) -> Parts:
     return [brick((1.0, w, t)), *(brick((1.0, t, h), (0, s * (w - t) / 2, 0)) for s in (-1, 1))]
 
 
+def _egg(rng: Rng) -> Parts:
+    return [ellipsoid((1.0, _uniform(rng, 0.5, 0.9), _uniform(rng, 0.4, 0.8)))]
+
+
+def _bucket(rng: Rng) -> Parts:
+    return [frustum(_uniform(rng, 0.5, 0.75), 0.9, _uniform(rng, 0.5, 0.9))]
+
+
+def _barrel(rng: Rng) -> Parts:
+    ends, belly = _uniform(rng, 0.3, 0.4) / 2, _uniform(rng, 0.4, 0.55) / 2
+    turn = np.arange(20) * 2 * math.pi / 20
+    circle = np.column_stack([np.zeros(20), np.cos(turn), np.sin(turn)])
+    stations = [(ends, -0.5), (ends, 0.5), (belly, -0.15), (belly, 0.15)]
+    return [convex(np.vstack([circle * radius + [x, 0, 0] for radius, x in stations]))]
+
+
+def _steps(rng: Rng) -> Parts:
+    w, h = _uniform(rng, 0.4, 0.9), _uniform(rng, 0.12, 0.25)
+    return [brick((1 - 0.33 * n, w, h), (0.165 * n, 0, h * n)) for n in range(3)]
+
+
+def _x_plan(rng: Rng) -> Parts:
+    t, h = _uniform(rng, 0.18, 0.35), _uniform(rng, 0.15, 0.5)
+    return [brick((1, t, h)), brick((t, _uniform(rng, 0.6, 1.0), h))]
+
+
+def _upright(plan: NDArray[np.float64], height: float) -> Parts:
+    return [convex(np.vstack([np.column_stack([plan, np.full(len(plan), z)]) for z in (0.0, height)]))]
+
+
+def _half_disc(rng: Rng) -> Parts:
+    height, turn = _uniform(rng, 0.2, 0.6), np.linspace(-math.pi / 2, math.pi / 2, 20)
+    return _upright(0.5 * np.column_stack([np.cos(turn), np.sin(turn)]), height)
+
+
+def _boat(rng: Rng) -> Parts:
+    w, h = _uniform(rng, 0.3, 0.5) / 2, _uniform(rng, 0.15, 0.3)
+    keel = [(x, s * 0.6 * w, 0) for x in (-0.45, 0.25) for s in (-1, 1)]
+    deck = [(x, s * w, h) for x in (-0.5, 0.2) for s in (-1, 1)]
+    return [convex([*keel, (0.35, 0, 0), *deck, (0.5, 0, h)]), brick((0.3, w, h * 0.8), (-0.25, 0, h))]
+
+
+def _triangle(rng: Rng) -> Parts:
+    height, across = _uniform(rng, 0.2, 0.7), _uniform(rng, 0.5, 0.9) / 2
+    return _upright(np.array([(-0.5, -across), (0.5, -across), (0.0, across)]), height)
+
+
+def _leaning_slab(rng: Rng) -> Parts:
+    t, w, h = _uniform(rng, 0.1, 0.25) / 2, _uniform(rng, 0.4, 0.9) / 2, _uniform(rng, 0.4, 0.7)
+    over = _uniform(rng, 0.1, 0.4)
+    return [convex([(x + (over if z else 0), y, z) for x in (-t, t) for y in (-w, w) for z in (0.0, h)])]
+
+
+def _mushroom(rng: Rng) -> Parts:
+    h = _uniform(rng, 0.3, 0.6)
+    stem = frustum(_uniform(rng, 0.25, 0.45), _uniform(rng, 0.25, 0.45), h)
+    return [stem, frustum(1.0, _uniform(rng, 0.3, 1.0), _uniform(rng, 0.12, 0.25), centre=(0, 0, h))]
+
+
+def _anchor(rng: Rng) -> Parts:
+    d = _uniform(rng, 0.08, 0.14)
+    rods = [((-0.5, 0, d), (0.5, 0, d)), ((0.35, -0.3, d), (0.35, 0.3, d)), ((0.5, 0, d), (0.5, 0, 0.45))]
+    return [bar(start, stop, d) for start, stop in rods]
+
+
+def _tower(rng: Rng) -> Parts:
+    h = _uniform(rng, 0.12, 0.3)
+    foot = frustum(1.0, _uniform(rng, 0.6, 1.0), h)
+    size = [_uniform(rng, low, high) for low, high in ((0.3, 0.5), (0.2, 0.3), (0.3, 0.6))]
+    return [foot, frustum(*size, centre=(_uniform(rng, -0.2, 0.2), 0, h))]
+
+
 @dataclass(frozen=True)
 class Family:
     """A family of shapes.
@@ -286,6 +360,20 @@ FAMILIES: dict[str, dict[str, Family]] = {
         "beam": Family(_beam, (0.5, 4.0), "I beam"),
         "pyramid": Family(_pyramid, (0.3, 2.0), "pyramid"),
         "channel": Family(_channel, (0.3, 3.0), "open channel"),
+    },
+    VALIDATION: {
+        "egg": Family(_egg, (0.3, 2.0), "ellipsoid"),
+        "bucket": Family(_bucket, (0.3, 2.0), "round, wider at its top"),
+        "barrel": Family(_barrel, (0.3, 2.0), "lying barrel"),
+        "steps": Family(_steps, (0.3, 2.0), "three steps"),
+        "x_plan": Family(_x_plan, (0.3, 2.0), "two crossing beams"),
+        "half_disc": Family(_half_disc, (0.3, 2.0), "half a disc"),
+        "boat": Family(_boat, (0.3, 2.0), "boat with a cabin"),
+        "triangle": Family(_triangle, (0.3, 2.0), "three-sided prism"),
+        "leaning_slab": Family(_leaning_slab, (0.3, 2.0), "slab that leans over"),
+        "mushroom": Family(_mushroom, (0.3, 2.0), "plate on a stem"),
+        "anchor": Family(_anchor, (0.3, 2.0), "bars, one of them up"),
+        "tower": Family(_tower, (0.3, 2.0), "tower on a wide foot"),
     },
 }
 
@@ -548,7 +636,7 @@ def draw(half: str, index: int) -> SceneSpec:
     Parameters
     ----------
     half : str
-        ``development`` or ``test``.
+        ``development``, ``test`` or ``validation``.
     index : int
         Number of the scene. Of five, three have objects; families follow one another in turn.
     """
@@ -626,7 +714,7 @@ def _draw_bodies(
             body = _draw_body(rng, other, _uniform(rng, 0.5, 1.0) * size, ())
             bodies.append(beside(body, (0.15, 1.0)))
     if "clutter" in chosen:
-        kind = "rock" if half == DEVELOPMENT else "boulders"
+        kind = {DEVELOPMENT: "rock", TEST: "boulders", VALIDATION: "egg"}[half]
         for _ in range(int(rng.integers(2, 6))):
             body = _draw_body(rng, kind, _uniform(rng, 0.06, 0.18) * size, ())
             clutter.append(beside(body, (0.1, 1.2)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import itertools
 import json
 import math
 import sys
@@ -54,9 +55,10 @@ def test_a_scene_is_the_same_every_time_and_unlike_the_others(population, drawn)
 
 
 def test_the_halves_share_no_family_and_no_shape(population, drawn):
-    development, test = (population.FAMILIES[half] for half in population.HALVES)
-    assert not set(development) & set(test)
-    assert not {f.make for f in development.values()} & {f.make for f in test.values()}
+    for one, two in itertools.combinations(population.HALVES, 2):
+        families, others = population.FAMILIES[one], population.FAMILIES[two]
+        assert not set(families) & set(others)
+        assert not {f.make for f in families.values()} & {f.make for f in others.values()}
     for half, specs in drawn.items():
         assert {body.family for spec in specs for body in spec.bodies} == set(population.FAMILIES[half])
 
