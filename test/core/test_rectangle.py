@@ -1,4 +1,4 @@
-"""Tests of plans that are rectangles: with errors of the sides, any convex plan is too free."""
+"""Tests of plans of a simple shape: with errors of the sides, any convex plan is too free."""
 
 import math
 from dataclasses import replace
@@ -66,31 +66,46 @@ def errors_cells(support, sizes, seeds=range(6)):
 def test_a_box_is_as_long_and_wide_as_it_is_though_its_sides_err(monkeypatch):
     support = box_support(0.6, 0.4, 0.5)
     rectangle = errors_cells(support, (0.6, 0.4))
-    monkeypatch.setattr(measurement, "is_rectangle", lambda *_: False)
+    monkeypatch.setattr(measurement, "shape_of_plan", lambda *_: None)
     any_plan = errors_cells(support, (0.6, 0.4))
     assert np.abs(rectangle).max() < 0.2
     assert any_plan.min() > 0.3
 
 
+def test_a_round_plan_is_not_as_narrow_as_its_sides_err(monkeypatch):
+    """The smallest rectangle lies where the errors make it narrowest."""
+    support = oval_support(0.5, 0.5)
+    circle = errors_cells(support, (0.5, 0.5))
+    monkeypatch.setattr(measurement, "shape_of_plan", lambda *_: None)
+    any_plan = errors_cells(support, (0.5, 0.5))
+    assert np.abs(circle).max() < 0.2
+    assert any_plan[1] < -0.25
+
+
 @pytest.mark.parametrize(
-    ("support", "is_one"),
+    ("support", "shape"),
     [
-        (box_support(0.6, 0.4, 0.5), True),
-        (box_support(0.4, 0.4, 1.0), True),
-        (box_support(0.8, 0.3, 0.2), True),
-        (oval_support(0.6, 0.4, 0.5), False),
-        (oval_support(0.4, 0.4), False),
+        (box_support(0.6, 0.4, 0.5), "rectangle"),
+        (box_support(0.4, 0.4, 1.0), "rectangle"),
+        (box_support(0.8, 0.3, 0.2), "rectangle"),
+        (oval_support(0.6, 0.4, 0.5), "ellipse"),
+        (oval_support(0.6, 0.6), "circle"),
         # Of either an edge's error leaves too little to tell a circle from a square.
-        (oval_support(2.0 * CELL_M, 2.0 * CELL_M), False),
-        (box_support(2.0 * CELL_M, 2.0 * CELL_M), False),
-        (corner_support(0.5), False),
+        (oval_support(2.0 * CELL_M, 2.0 * CELL_M), None),
+        (box_support(2.0 * CELL_M, 2.0 * CELL_M), None),
+        (corner_support(0.5), None),
     ],
 )
-def test_a_plan_is_a_rectangle_only_where_sides_tell_one(monkeypatch, support, is_one):
+def test_a_plan_has_a_shape_only_where_sides_tell_it(monkeypatch, support, shape):
     told = []
-    ask = measurement.is_rectangle
-    monkeypatch.setattr(measurement, "is_rectangle", lambda *given: told.append(ask(*given)) or told[-1])
+    ask = measurement.shape_of_plan
+
+    def watched(*given):
+        told.append(ask(*given))
+        return told[-1]
+
+    monkeypatch.setattr(measurement, "shape_of_plan", watched)
     for seed in range(4):
         fit = PlanFit(noisy(support, seed), grid_of_plan(support))
         fit.plan(measurement._rectangle(fit.solve(), fit.centre))
-    assert told == [is_one] * 4
+    assert told == [shape] * 4

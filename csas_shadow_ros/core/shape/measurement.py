@@ -38,7 +38,7 @@ from .contour import Contour, contour_height, contour_of
 from .echo_sides import echo_reach_px
 from .mesh import Dimensions, digits_of, measure
 from .opposed import doubt_cells, opposed_share, opposed_sides
-from .rectangle import Rectangle, SupportSamples, fitted_rectangle, is_rectangle, looks_over
+from .rectangle import Rectangle, SupportSamples, fitted_plan, looks_over, shape_of_plan
 from .seabed import largest_piece, leaves_image
 from .volume import VoxelGrid
 
@@ -687,9 +687,9 @@ class PlanFit:
         weights = np.where(alone, _VOXEL_ALONE, _VOXEL_WEIGHT)
         self._weights = np.concatenate([np.ones(self.count), weights])
         # Five numbers need no voxels beside sides.
-        self._tells_rectangle = np.concatenate([np.ones(self.count, np.bool_), alone])
+        self._tells_shape = np.concatenate([np.ones(self.count, np.bool_), alone])
         self._robust = np.ones_like(self._weights)
-        self._is_rectangle = False
+        self._shape: str | None = None
         self.spread_m = 0.0
         self.beyond_m = np.zeros(self.count)
         self.counts = np.ones(self.count, np.bool_)
@@ -744,7 +744,7 @@ class PlanFit:
         return np.asarray(self._basis(self.directions) @ solution)
 
     def plan(self, smallest: Rectangle) -> Rectangle:
-        """Return the plan's own rectangle where it is one, else the smallest one round it.
+        """Return the rectangle round the plan's own shape where it has one, else the smallest round it.
 
         Parameters
         ----------
@@ -752,20 +752,20 @@ class PlanFit:
             The latter, by what `solve` returned.
         """
         samples = self._samples(self._weights * self._robust)
-        self._is_rectangle = is_rectangle(samples, smallest, samples.scatter_m(self.beyond_m))
-        return fitted_rectangle(samples, smallest) if self._is_rectangle else smallest
+        self._shape = shape_of_plan(samples, smallest, samples.scatter_m(self.beyond_m))
+        return smallest if self._shape is None else fitted_plan(self._shape, samples, smallest)
 
     def resampled(self, share: FloatArray, plan: Rectangle) -> Rectangle:
         """Return the plan as `plan` does, each side counting `share` times, shape (count,)."""
         weights = self._weights * self._robust
         weights[: self.count] *= np.sqrt(share)
-        if self._is_rectangle:
-            return fitted_rectangle(self._samples(weights), plan)
+        if self._shape is not None:
+            return fitted_plan(self._shape, self._samples(weights), plan)
         return _rectangle(self._basis(self.directions) @ self._solve(weights), self.centre)
 
     def _samples(self, weights: FloatArray) -> SupportSamples:
         about = self.centre[0] * np.cos(self._phi) + self.centre[1] * np.sin(self._phi)
-        weights = weights * self._tells_rectangle
+        weights = weights * self._tells_shape
         return SupportSamples(self._phi, self._aperture, self._values + about, weights, self.count)
 
 

@@ -1,8 +1,10 @@
-"""The plan of a rectangle, where the sides of shadows tell one.
+"""The plan of a rectangle, a circle or an ellipse, where the sides of shadows tell one.
 
-Any convex plan can be fitted to the sides (`measurement.PlanFit`). With their errors that is too free: where
-two faces of a box meet, it cuts the corner, and the faces move out instead. A box comes out half a cell too
-wide to either side. So what a rectangle tells as well is one: five numbers instead of dozens.
+Any convex plan can be fitted to the sides (`measurement.PlanFit`). With their errors that is too free. Where
+two faces of a box meet, it cuts the corner, and the faces move out instead: a box comes out half a cell too
+wide to either side. And of a round plan the smallest rectangle lies where the errors make it narrowest: a
+drum comes out half a cell too narrow. So what a simple shape tells as well is one: three or five numbers
+instead of dozens.
 """
 
 from __future__ import annotations
@@ -17,10 +19,10 @@ from scipy.optimize import least_squares
 
 FloatArray = NDArray[np.float64]
 
-#: A rectangle tells the sides as well as any convex plan if they scatter about it by so many times as much at
-#: most (rms), and better than an ellipse if they scatter about that by so many times as much: nothing
-#: that is round and a few cells wide is a box. What other limits change: docs/method.md.
-_AS_WELL, _BETTER = 1.4, 1.1
+#: A shape tells the sides as well as any convex plan if they scatter about it by so many times as much at
+#: most (rms), and better than another shape if they scatter about that by so many times as much: nothing that
+#: is round and a few cells wide is a box. What other limits change: docs/method.md.
+_AS_WELL, _BETTER = 1.5, 1.1
 #: Looks over an aperture.
 _LOOKS = 9
 #: A fit begins at so many headings (rad) about that of the smallest rectangle.
@@ -91,41 +93,49 @@ def _oval(angle: FloatArray, along: float, across: float) -> FloatArray:
     return 0.5 * np.hypot(along * np.cos(angle), across * np.sin(angle))
 
 
-def _fitted(
-    shape: Callable[[FloatArray, float, float], FloatArray],
-    samples: SupportSamples,
-    start: Rectangle,
-    turns: tuple[float, ...],
-) -> tuple[Rectangle, float]:
-    """Fit a shape, which says where it ends by the angle to its length.
+def _round(angle: FloatArray, along: float, _: float) -> FloatArray:
+    return np.full(angle.shape, 0.5 * along)
 
-    Return the smallest rectangle round it, and how far the sides scatter about it, m.
-    """
+
+#: How far a shape reaches from its middle, by the angle to its length.
+_SHAPES: dict[str, Callable[[FloatArray, float, float], FloatArray]] = {
+    "rectangle": _box,
+    "ellipse": _oval,
+    "circle": _round,
+}
+
+
+def _fitted(
+    shape: str, samples: SupportSamples, start: Rectangle, turns: tuple[float, ...] = (0.0,)
+) -> tuple[Rectangle, float]:
+    """Fit a shape: return the smallest rectangle round it, and how far the sides scatter about it, m."""
     angles = looks_over(samples.direction_rad, samples.aperture_rad)
     east, north = np.cos(angles).mean(axis=1), np.sin(angles).mean(axis=1)
+    count = 3 if shape == "circle" else 5
 
     def beyond(x: FloatArray) -> FloatArray:
-        middle = x[0] * east + x[1] * north
-        ends = shape(angles - x[4], abs(x[2]), abs(x[3])).mean(axis=1)
-        return np.asarray(samples.support_m - middle - ends)
+        along, across, heading = x[2:] if count == 5 else (x[2], x[2], 0.0)
+        ends = _SHAPES[shape](angles - heading, abs(along), abs(across)).mean(axis=1)
+        return np.asarray(samples.support_m - x[0] * east - x[1] * north - ends)
 
     firsts = (
-        [*start.position_m, start.length_m, start.width_m, start.heading_rad + turn] for turn in turns
+        [*start.position_m, start.length_m, start.width_m, start.heading_rad + turn][:count] for turn in turns
     )
     best = min(
         (least_squares(lambda x: samples.weight * beyond(x), first) for first in firsts),
         key=lambda found: float(found.cost),
     )
-    x, y, along, across, heading = (float(value) for value in best.x)
+    scatter_m = samples.scatter_m(beyond(np.asarray(best.x)))
+    x, y, along, *more = (float(value) for value in best.x)
+    across, heading = more or (along, start.heading_rad)
     along, across = abs(along), abs(across)
     if along < across:
         along, across, heading = across, along, heading + math.pi / 2.0
-    plan = Rectangle(along, across, heading % math.pi, (x, y))
-    return plan, samples.scatter_m(beyond(np.asarray(best.x)))
+    return Rectangle(along, across, heading % math.pi, (x, y)), scatter_m
 
 
-def is_rectangle(samples: SupportSamples, start: Rectangle, scatter_m: float) -> bool:
-    """Say whether a rectangle tells the sides as well as any convex plan does, and better than an ellipse.
+def shape_of_plan(samples: SupportSamples, start: Rectangle, scatter_m: float) -> str | None:
+    """Return the shape that tells the sides as well as any convex plan does, and better than the others.
 
     Parameters
     ----------
@@ -135,13 +145,33 @@ def is_rectangle(samples: SupportSamples, start: Rectangle, scatter_m: float) ->
         The smallest rectangle round the convex plan that fits them best.
     scatter_m : float
         How far they scatter about that plan, m (rms).
+
+    Returns
+    -------
+    {"rectangle", "ellipse", "circle"} or None
+        A circle where an ellipse tells the sides no better.
     """
-    box = _fitted(_box, samples, start, _STARTS_RAD)[1]
-    return box <= _AS_WELL * scatter_m and _fitted(_oval, samples, start, _STARTS_RAD)[1] >= _BETTER * box
+    box, oval = (_fitted(shape, samples, start, _STARTS_RAD)[1] for shape in ("rectangle", "ellipse"))
+    if min(box, oval) > _AS_WELL * scatter_m:
+        return None
+    if oval >= _BETTER * box:
+        return "rectangle"
+    if box < _BETTER * oval:
+        return None
+    return "ellipse" if _fitted("circle", samples, start)[1] >= _BETTER * oval else "circle"
 
 
-def fitted_rectangle(samples: SupportSamples, start: Rectangle) -> Rectangle:
-    """Fit a rectangle to samples; `start` is near it.
+def fitted_plan(shape: str, samples: SupportSamples, start: Rectangle) -> Rectangle:
+    """Fit a shape to samples; return the smallest rectangle round it. `start` is near it.
+
+    Parameters
+    ----------
+    shape : {"rectangle", "ellipse", "circle"}
+        As `shape_of_plan` tells.
+    samples : SupportSamples
+        The sides.
+    start : Rectangle
+        Of its heading is the rectangle round a circle.
 
     Examples
     --------
@@ -150,13 +180,13 @@ def fitted_rectangle(samples: SupportSamples, start: Rectangle) -> Rectangle:
     >>> box = 0.4 * np.abs(np.cos(phi)) + 0.2 * np.abs(np.sin(phi))
     >>> samples = SupportSamples(phi, np.zeros(120), box, np.ones(120), 120)
     >>> start = Rectangle(0.9, 0.5, 0.1, (0.0, 0.0))
-    >>> found = fitted_rectangle(samples, start)
+    >>> shape_of_plan(samples, start, 0.01)
+    'rectangle'
+    >>> found = fitted_plan("rectangle", samples, start)
     >>> round(found.length_m, 3), round(found.width_m, 3)
     (0.8, 0.4)
-    >>> is_rectangle(samples, start, 0.01)
-    True
     """
-    return _fitted(_box, samples, start, (0.0,))[0]
+    return _fitted(shape, samples, start)[0]
 
 
-__all__ = ["Rectangle", "SupportSamples", "fitted_rectangle", "is_rectangle", "looks_over"]
+__all__ = ["Rectangle", "SupportSamples", "fitted_plan", "looks_over", "shape_of_plan"]
