@@ -86,7 +86,8 @@ def test_a_low_flank_that_shines_is_on_the_plan(monkeypatch):
     found = run(made.image, made.track, COARSE).dimensions
     monkeypatch.setattr(measurement, "echo_reach_px", lambda *_: (math.nan, math.nan))
     narrower = run(made.image, made.track, COARSE).dimensions
-    assert narrower.length_m + 0.02 < found.length_m < 0.6
+    # Its plan is a circle: the echoes of all sides move one diameter.
+    assert narrower.length_m + 0.01 < found.length_m < 0.6
     assert narrower.width_m + 0.01 < found.width_m < 0.6
 
 
