@@ -97,6 +97,15 @@ def test_a_round_plan_is_not_as_narrow_as_its_sides_err(monkeypatch):
     ],
 )
 def test_a_plan_has_a_shape_only_where_sides_tell_it(monkeypatch, support, shape):
+    assert told_shapes(monkeypatch, support) == [shape] * 4
+
+
+def test_a_circle_of_six_cells_is_no_rectangle(monkeypatch):
+    assert "rectangle" not in told_shapes(monkeypatch, oval_support(0.4, 0.4))
+
+
+def told_shapes(monkeypatch, support):
+    """Return the shape that each of four draws of errors tells."""
     told = []
     ask = measurement.shape_of_plan
 
@@ -108,4 +117,4 @@ def test_a_plan_has_a_shape_only_where_sides_tell_it(monkeypatch, support, shape
     for seed in range(4):
         fit = PlanFit(noisy(support, seed), grid_of_plan(support))
         fit.plan(measurement._rectangle(fit.solve(), fit.centre))
-    assert told == [shape] * 4
+    return told

@@ -742,9 +742,9 @@ class Carver:
         return whole
 
     def _undercut(self, body: VoxelGrid, opened: VoxelGrid) -> VoxelGrid:
-        """Take from a body what is seen lit where only sidelobes of its echo may reach, but for shadow.
+        """Remove from a body what is seen lit where only sidelobes of its echo may reach.
 
-        What of it the shadows ask for stays, with what that stands on.
+        What the shadows ask for stays, with what it stands on.
         """
         with np.errstate(invalid="ignore"):
             seen_lit = body.occupied & (opened.likelihood >= _SIDELOBE_VIEWS * body.threshold)
@@ -1077,8 +1077,9 @@ class Carver:
             return view, echoes.zones(kept, *reaches_cells)
 
         for _, (view, zones) in in_order(look, self._masks.values(), _LOOKERS):
-            for sums, zone in zip(looks, zones, strict=False):
-                sums.change_mask(view.pixels, view.pixels, view.info, zone)
+            if zones:
+                for sums, zone in zip(looks, zones, strict=True):
+                    sums.change_mask(view.pixels, view.pixels, view.info, zone)
         found = []
         for sums in looks:
             likelihood, views = first.likelihood.copy(), first.views.copy()
