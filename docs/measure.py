@@ -50,7 +50,7 @@ from csas_shadow_ros.core.parameters import (
 )
 from csas_shadow_ros.core.pipeline import ProcessedView, run
 from csas_shadow_ros.core.search.bodies import SignEvidence, spectrum_sign_evidence
-from csas_shadow_ros.core.shape import measurement
+from csas_shadow_ros.core.shape import cap, measurement
 from csas_shadow_ros.core.shape.carving import Carver
 from csas_shadow_ros.core.shape.hollows import EchoLook, _looks, _surface
 from csas_shadow_ros.core.shape.layover import layover_per_metre
@@ -485,13 +485,13 @@ def _own_support(sides: Sequence[SilhouetteSides]) -> NDArray[np.float64]:
 
 
 #: The measures with one step left out or taken otherwise.
-MEASURES: dict[str, dict[str, Any]] = {
+MEASURES: dict[str, dict[Any, dict[str, Any]]] = {
     "default": {},
-    "  each view alone": {"agreed_support": _own_support},
-    "  the sides beside alone": {"_ALL_SIDES": 0.0},
-    "  no foot": {"_FLARE_CELLS": math.inf},
-    "  no upright walls": {"_MOST": 1.0},
-    "  every top flat": {"_MOST": 1.0, "_DOME_SLACK": (1.0, 1.0 + 1e-9)},
+    "  each view alone": {measurement: {"agreed_support": _own_support}},
+    "  the sides beside alone": {measurement: {"_ALL_SIDES": 0.0}},
+    "  no foot": {measurement: {"_FLARE_CELLS": math.inf}},
+    "  no upright walls": {measurement: {"_MOST": 1.0}},
+    "  every top flat": {measurement: {"_MOST": 1.0}, cap: {"_DOME_SLACK": (1.0, 1.0 + 1e-9)}},
 }
 
 
@@ -508,8 +508,10 @@ def sizes(names: tuple[str, ...]) -> None:
                 raise SystemExit(f"nothing was found of {name}, seed {seed}")
             true = measure(made.truth.target)
             found = {"surface": measure(result.mesh)}
-            for label, patch in MEASURES.items():
-                with patched(measurement, **patch):
+            for label, patches in MEASURES.items():
+                with contextlib.ExitStack() as stack:
+                    for module, patch in patches.items():
+                        stack.enter_context(patched(module, **patch))
                     found[label] = measurement.measure_object(result.grid, result.mesh, result.sides)
             for label, sizes_found in found.items():
                 off = [

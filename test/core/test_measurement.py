@@ -23,6 +23,7 @@ from core_data import (
 
 from csas_shadow_ros.core.geometry import Acoustics, View
 from csas_shadow_ros.core.parameters import CarvingParameters
+from csas_shadow_ros.core.shape.cap import cap_of
 from csas_shadow_ros.core.shape.carving import (
     MASK_COVERED,
     MASK_OUTSIDE,
@@ -36,7 +37,6 @@ from csas_shadow_ros.core.shape.measurement import (
     SHAPES,
     PlanFit,
     agreed_sides,
-    cap_of,
     leaning_agreed,
     levels_of_mask,
     measure_object,
