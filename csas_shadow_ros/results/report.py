@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import importlib.metadata
+import itertools
 import json
 import math
 import platform
@@ -463,10 +464,31 @@ def _sides(d: Mapping[str, Any]) -> str:
     return f"{d['length_m']:.3f} x {d['width_m']:.3f} x {d['height_m']:.3f} m"
 
 
+def spread_text(value: float, ends: Sequence[float], digits: int) -> str:
+    """Say how far an interval reaches from a value: as far to either side, or down and up.
+
+    Parameters
+    ----------
+    value : float
+        The value.
+    ends : sequence of float
+        Low and high end, in its unit.
+    digits : int
+        After the point.
+
+    Examples
+    --------
+    >>> spread_text(0.5, (0.4, 0.6), 2), spread_text(0.5, (0.45, 0.7), 2)
+    ('± 0.10', '-0.05 +0.20')
+    """
+    down, up = (f"{abs(end - value):.{digits}f}" for end in ends)
+    return f"± {up}" if down == up else f"-{down} +{up}"
+
+
 def _size_lines(mine: Mapping[str, Any], true: Mapping[str, Any]) -> list[str]:
     """Write the table of sizes, found and true."""
     intervals = mine.get("intervals") or {}
-    sure = f"{'95 %':>12}" if intervals else ""
+    sure = f"{'95 %':>18}" if intervals else ""
     lines = [f"{'':<14}{'found':>12}{sure}" + (f"{'truth':>12}{'difference':>12}" if true else "")]
     rows = (
         ("length", "length_m", "m"),
@@ -488,10 +510,14 @@ def _size_lines(mine: Mapping[str, Any], true: Mapping[str, Any]) -> list[str]:
             cells.insert(0, "-")
         if intervals:
             name = {0: "position_x_m", 1: "position_y_m", "heading_deg": "heading_rad"}.get(key, key)
-            low, high = intervals.get(name, (math.nan, math.nan))
-            half = (high - low) / 2.0 * (180.0 / math.pi if name == "heading_rad" else 1.0)
-            cells.insert(1, f"± {half:.{digits}f} {unit}")
-        line = f"{label:<14}" + "".join(f"{cell:>12}" for cell in cells)
+            scale = 180.0 / math.pi if name == "heading_rad" else 1.0
+            ends = [end * scale for end in intervals.get(name, (math.nan, math.nan))]
+            value = math.nan if values[0] is None else values[0]
+            cells.insert(1, f"{spread_text(value, ends, digits)} {unit}")
+        widths = (12, 18) if intervals else (12,)
+        line = f"{label:<14}" + "".join(
+            f"{cell:>{width}}" for cell, width in itertools.zip_longest(cells, widths, fillvalue=12)
+        )
         if mine and true and None not in values:
             off = values[0] - values[1]
             if unit == "°":

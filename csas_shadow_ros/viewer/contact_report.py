@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..core.imaging.mask_codes import MASK_SHADOW
 from ..core.shape.mesh import mesh_from_grid
+from ..results.report import spread_text
 from .contacts import axis_bearing_deg, north_shown_deg
 from .crop import HIGH_SHOWN_DB as _HIGH
 from .crop import LOW_SHOWN_DB as _LOW
@@ -94,20 +95,16 @@ def _value(d: Mapping[str, Any], key: str, unit: str, digits: int, *, interval: 
     value = d.get(key)
     if value is None:
         return "—"
-    half = _half_width(d, key) if interval else None
-    return f"{value:.{digits}f}{'' if half is None else f' ± {half:.{digits}f}'} {unit}"
-
-
-def _half_width(d: Mapping[str, Any], key: str) -> float | None:
-    between = (d.get("intervals") or {}).get(key)
-    return (between[1] - between[0]) / 2 if between and None not in between else None
+    ends = (d.get("intervals") or {}).get(key) if interval else None
+    spread = "" if not ends or None in ends else f" {spread_text(value, ends, digits)}"
+    return f"{value:.{digits}f}{spread} {unit}"
 
 
 def _axis(d: Mapping[str, Any], north: float) -> str:
     if d.get("heading_rad") is None:
         return "—"
-    half = _half_width(d, "heading_rad")
-    spread = "" if half is None else f" ± {math.degrees(half):.1f}"
+    low, high = (d.get("intervals") or {}).get("heading_rad") or (None, None)
+    spread = "" if low is None or high is None else f" ± {math.degrees((high - low) / 2.0):.1f}"
     return f"{axis_bearing_deg(d['heading_rad'], north):05.1f}{spread} °"
 
 

@@ -131,6 +131,22 @@ def test_no_height_is_told_above_what_the_shadows_leave():
     assert told.height_m == 0.19
 
 
+def test_a_contour_far_above_what_the_shadows_leave_is_not_the_target_s():
+    """Of a bucket that stood wider at its top, contours told 1.10 m; its shadows left 1.03 m."""
+    assert contour_height([(info, flat_top(info)) for info in INFOS], (0.0, 0.0), 0.12) is None
+
+
+def point(info, height=0.4, half=0.3):
+    across = np.arange(-half, half, 0.012)
+    up = 0.002 + height * (1.0 - np.abs(across) / half)
+    return contour_through(info, across, np.zeros(len(across)), up)
+
+
+def test_a_top_that_few_columns_reach_has_no_height_of_its_own():
+    """Views lose the tip of a cone, and all lose as much: they agree on too little."""
+    assert contour_height([(info, point(info)) for info in FINE], (0.0, 0.0), 2.0) is None
+
+
 def test_a_contour_ends_where_its_column_s_last_shadow_does():
     info = INFOS[0]
     down = info.down_range_of_rows()

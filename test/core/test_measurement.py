@@ -366,6 +366,35 @@ def test_a_tip_that_views_cut_each_at_its_height_is_as_high_as_half_of_them_say(
     assert cap_of(soft, GRAZING).half_m == cap_of(soft, GRAZING).top_m
 
 
+@pytest.mark.parametrize("top_m", [0.0, 0.08])
+@pytest.mark.parametrize("slope", [0.7, 1.4])
+def test_a_top_that_may_be_a_point_is_told_from_a_flat_one(slope, top_m):
+    """A cone, whole or cut off where it is eight cells wide. No view segmented a tip of two cells."""
+    cell, high = 0.02, 0.25
+    volume = Volume.around((0.0, 0.0), (0.8, 0.8, 0.4), 0.005)
+    z, y, x = np.meshgrid(volume.z_m, volume.y_m, volume.x_m, indexing="ij")
+    inside = (high - z) / slope - cell / 4.0 - np.hypot(x, y)
+    flat = high - slope * top_m
+    cap = flat + math.tan(GRAZING) * (top_m - np.hypot(x, y))
+    occupied = (inside > 0.0) & (z < (high - slope * cell if top_m == 0.0 else np.maximum(flat, cap)))
+    told = cap_of(grid_of(occupied, volume), GRAZING, cell, cell * math.tan(GRAZING), cell)
+    if top_m == 0.0:
+        assert told.apex_m == pytest.approx(high, abs=0.1 * slope * cell + volume.voxel_size_m)
+        assert told.top_m < high - 0.5 * slope * cell
+        assert math.isnan(cap_of(grid_of(occupied, volume), GRAZING, cell).apex_m)  # no cell, no point
+    else:
+        assert math.isnan(told.apex_m)
+
+
+def test_a_ridge_is_no_point():
+    cell = 0.02
+    volume = Volume.around((0.0, 0.0), (0.8, 0.8, 0.4), 0.005)
+    z, y, x = np.meshgrid(volume.z_m, volume.y_m, volume.x_m, indexing="ij")
+    rest = np.maximum(np.abs(y) - 0.15, 0.0)
+    occupied = ((0.25 - z) / 1.0 - np.hypot(x, rest) > 0.0) & (z < 0.25 - cell)
+    assert math.isnan(cap_of(grid_of(occupied, volume), GRAZING, cell, 0.01, cell).apex_m)
+
+
 @pytest.mark.parametrize("radius_m", [0.25, 0.4, 0.6])
 @pytest.mark.parametrize("high_m", [0.292, 0.3, 0.307])
 def test_a_dome_is_told_by_how_gradually_its_cap_begins(radius_m, high_m):

@@ -710,7 +710,8 @@ class App {
   withAxis(d) {
     if (!Number.isFinite(d?.heading_rad)) return d;
     const bears = (rad) => 90 + this.north - rad / RAD, [low, high] = d.intervals?.heading_rad ?? [];
-    const axis = ((bears(d.heading_rad) % 180) + 180) % 180, intervals = { ...d.intervals, ...(Number.isFinite(low) && Number.isFinite(high) ? { axis: [bears(high), bears(low)] } : {}) };
+    const axis = ((bears(d.heading_rad) % 180) + 180) % 180, turn = axis - bears(d.heading_rad);
+    const intervals = { ...d.intervals, ...(Number.isFinite(low) && Number.isFinite(high) ? { axis: [bears(high) + turn, bears(low) + turn] } : {}) };
     return { ...d, axis, intervals };
   }
 
@@ -735,22 +736,27 @@ class App {
     if (!d && !m) return void row(["", c?.reason ?? (this.scene.volumes.main ? "carved; not measured yet" : this.scene.status || "nothing carved yet")]);
     row(["", "found, 95 %", ...(t ? ["truth"] : []), ...(m?.object ? ["surface here"] : []), ...(o ? ["run B", "B − A"] : [])], true);
     const deg = 1 / RAD, half = (one, key) => (one?.intervals?.[key] ? (one.intervals[key][1] - one.intervals[key][0]) / 2 : undefined);
-    const told = (v, i, digits, unit) => (v === undefined || v === null ? "—" : `${v.toFixed(digits).padStart(unit === "°" ? 5 : 0, "0")}${i === undefined ? "" : ` ± ${i.toFixed(digits)}`} ${unit}`);
-    const names = [["length_m", "Length", "m", 2, 1], ["width_m", "Width", "m", 2, 1], ["height_m", "Height", "m", 2, 1], ["volume_m3", "Volume", "m³", 3, 1], ["axis", "Axis bears", "°", 1, 1]];
-    for (const [key, label, unit, digits, by] of names) {
+    // As far to either side, or down and up.
+    const spread = (v, [low, high], digits) => {
+      const [down, up] = [v - low, high - v].map((reach) => Math.abs(reach).toFixed(digits));
+      return down === up ? `± ${up}` : `−${down} +${up}`;
+    };
+    const told = (v, ends, digits, unit) => (v === undefined || v === null ? "—" : `${v.toFixed(digits).padStart(unit === "°" ? 5 : 0, "0")}${ends === undefined ? "" : ` ${spread(v, ends, digits)}`} ${unit}`);
+    const names = [["length_m", "Length", "m", 2], ["width_m", "Width", "m", 2], ["height_m", "Height", "m", 2], ["volume_m3", "Volume", "m³", 3], ["axis", "Axis bears", "°", 1]];
+    for (const [key, label, unit, digits] of names) {
       const v = d?.[key], i = half(d, key);
       if (v === undefined && !m?.object) continue;
       if (key === "axis" && v === undefined) continue;
-      const cells = [label, told(v === undefined || v === null ? v : v * by, i === undefined ? i : i * by, digits, unit)];
-      if (t) cells.push(t[key] === undefined || t[key] === null ? "" : told(t[key] * by, undefined, digits, unit));
+      const cells = [label, told(v, d?.intervals?.[key], digits, unit)];
+      if (t) cells.push(t[key] === undefined || t[key] === null ? "" : told(t[key], undefined, digits, unit));
       if (m?.object) cells.push(m[key] === undefined ? "" : told(m[key], undefined, digits, unit));
       if (o) {
-        cells.push(told(o[key] === undefined ? undefined : o[key] * by, half(o, key) === undefined ? undefined : half(o, key) * by, digits, unit));
+        cells.push(told(o[key], o.intervals?.[key], digits, unit));
         let off = (o[key] ?? NaN) - v;
         if (key === "axis") off = ((off + 270) % 180) - 90;
         // Two independent 95 % intervals: theirs of the difference.
         const both = i === undefined || half(o, key) === undefined ? undefined : Math.hypot(i, half(o, key));
-        cells.push(Number.isFinite(off) ? [`${off > 0 ? "+" : ""}${(off * by).toFixed(digits)} ${unit}`, both !== undefined && Math.abs(off) > both ? "differs" : "agrees"] : "—");
+        cells.push(Number.isFinite(off) ? [`${off > 0 ? "+" : ""}${off.toFixed(digits)} ${unit}`, both !== undefined && Math.abs(off) > both ? "differs" : "agrees"] : "—");
       }
       row(cells);
     }

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from ..methods import method_named
 from .volume import VoxelGrid
 
+FloatArray = NDArray[np.float64]
+
 #: Slack under the cap's top is told in voxels, or in so much of the height that casts a cell of shadow where
 #: that is more: edges of layers are no surer, however fine the voxels. Two tables of 0.32 and 0.33 m, in
 #: voxels of a fifth of a cell, are 0.36 m high, 0.44 and 0.43 m by voxels alone; at half 0.43 and 0.40 m, at
@@ -40,6 +42,22 @@ _DOME_SLACK = (0.5, 2.0)
 #: half and 52 of ten tapering families whose height no shadow tells otherwise: 47 and 69 % of them are within
 #: 5 % or a voxel without it, 47 and 75 % with it, 42 and 73 % at half, 47 and 58 % at double of the share.
 _TIP_VOXELS, TIP_SHARE = 2, 0.5
+#: A view does not segment a tip that is narrower than one to two cells. Flanks that go on to the carved top
+#: meet above it. They are looked at up to where their inscribed radius is so large (cross-range cells; of a
+#: thinner body: this share of its own), from this share of that on. And they lead to a narrow top, of less
+#: than this share of it: what hardly narrows is a wall. Over fewer layers nothing is told.
+_FLANK_CELLS, _FLANK_NEARLY_ALL = 3.0, 0.9
+_FLANK_FROM, _FLANK_TO, _FLANK_LAYERS = 0.4, 0.6, 3
+#: They rise so many times as steeply as the sonar looks down: as steep alone is the cap of a flat top.
+_FLANK_STEEP = 1.3
+#: Their layers have less than so many times the area of their inscribed circle (a square 1.3). A ridge ends
+#: in a line: views from beside it see how high it is.
+_ELONGATED = 2.0
+#: If the carved top is narrower than where they lead by more than this (inscribed radius, cross-range cells),
+#: it is flat.
+_BLUNT_CELLS = 0.6
+#: The edge of a carved layer lies so far inside of the body there (cross-range cells).
+_INSIDE_CELLS = 0.25
 
 
 @dataclass(frozen=True)
@@ -56,15 +74,20 @@ class Cap:
         Height (m) of the cap's own top.
     half_m : float
         Height (m) that half of the views keep there: at least the cap's top.
+    apex_m : float
+        Height (m) of the top if it is a point, where its flanks meet; NaN if they do not go on to it.
     """
 
     begins_m: float
     dome_m: float
     top_m: float
     half_m: float
+    apex_m: float = math.nan
 
 
-def cap_of(grid: VoxelGrid, grazing_rad: float, hole_m: float = 0.0, cell_m: float = 0.0) -> Cap:
+def cap_of(
+    grid: VoxelGrid, grazing_rad: float, hole_m: float = 0.0, cell_m: float = 0.0, across_m: float = math.nan
+) -> Cap:
     """Find the cap that carving leaves on the top of a shape.
 
     Parameters
@@ -77,6 +100,8 @@ def cap_of(grid: VoxelGrid, grazing_rad: float, hole_m: float = 0.0, cell_m: flo
         Holes in a layer that are less than twice as wide are speckle, m.
     cell_m : float
         How high what casts a cell of shadow is, m: a layer's edge is no surer than a share of it.
+    across_m : float
+        Cross-range resolution, m; NaN: the top is not looked at for a point.
 
     Notes
     -----
@@ -89,6 +114,7 @@ def cap_of(grid: VoxelGrid, grazing_rad: float, hole_m: float = 0.0, cell_m: flo
     layers = np.flatnonzero(grid.occupied.any(axis=(1, 2)))
     faces = grid.volume.z_m[layers] + d / 2.0
     inside = np.array([_inscribed(grid.occupied[k], hole_m / d) for k in layers])
+    areas = grid.occupied[layers].sum(axis=(1, 2))
     reach = faces + math.tan(grazing_rad) * (inside - 0.5) * d
     top = float(reach[inside >= min(_CAP_TIP, _CAP_TIP_SHARE * inside.max())].max())
 
@@ -113,7 +139,42 @@ def cap_of(grid: VoxelGrid, grazing_rad: float, hole_m: float = 0.0, cell_m: flo
         float(np.clip(dome, begins, max(begins, faces[-1]))),
         float(faces[-1]),
         float(faces[-1]) + _kept_above(grid, int(layers[-1])),
+        _apex(faces, (inside - 0.5) * d, areas * d**2, grazing_rad, across_m),
     )
+
+
+def _apex(
+    faces: FloatArray, radii: FloatArray, areas: FloatArray, grazing_rad: float, across_m: float
+) -> float:
+    """Return how high a carved top is if it is a point (m); NaN if it is none.
+
+    Parameters
+    ----------
+    faces, radii, areas : ndarray, shape (n,)
+        Height of each layer's top (m), its inscribed radius (m) and its area (m²), upwards.
+    grazing_rad, across_m : float
+        ψ, and cross-range resolution, m; NaN: nothing is told.
+    """
+    if math.isnan(across_m):
+        return math.nan
+    # From the top down, as far as it widens.
+    wide = min(_FLANK_CELLS * across_m, _FLANK_NEARLY_ALL * float(radii.max()))
+    down = radii[::-1]
+    over = (down > wide) | (down < np.maximum.accumulate(down) - 0.1 * wide)
+    first = len(radii) - (int(over.argmax()) if over.any() else len(radii))
+    z, r = faces[first:], radii[first:]
+    flank = r >= _FLANK_FROM * wide
+    if np.count_nonzero(flank) < _FLANK_LAYERS or r[-1] > _FLANK_TO * wide:
+        return math.nan
+    if float(np.median(areas[first:][flank] / r[flank] ** 2)) > math.pi * _ELONGATED:
+        return math.nan
+    narrows, level = np.polyfit(z[flank], r[flank], 1)
+    if narrows >= 0.0 or -1.0 / narrows < _FLANK_STEEP * math.tan(grazing_rad):
+        return math.nan
+    blunt = float(narrows * z[-1] + level - r[-1])
+    if blunt > _BLUNT_CELLS * across_m:
+        return math.nan
+    return float(-(level + _INSIDE_CELLS * across_m) / narrows)
 
 
 def _inscribed(layer: NDArray[np.bool_], room: float) -> float:

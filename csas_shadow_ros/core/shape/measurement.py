@@ -939,8 +939,8 @@ def measure_object(
     aperture = float(np.median([side.info.aperture_rad for side in sides]))
     along, beside = (across * doubt_cells(*apart, plan.heading_rad + t, aperture) for t in (0.0, math.pi / 2))
     intervals = _plan_intervals(plan, smallest, resampled, edge, (along, beside))
-    cap = cap_of(grid, grazing, HOLE_CELLS * across, down * math.tan(grazing))
-    sigma = math.hypot(d / 2.0, down * math.tan(grazing))
+    cap = cap_of(grid, grazing, HOLE_CELLS * across, down * math.tan(grazing), across)
+    sigma, above = math.hypot(d / 2.0, down * math.tan(grazing)), 0.0
     measured = replace(
         whole,
         length_m=plan.length_m,
@@ -957,13 +957,15 @@ def measure_object(
         height, sigma = told.height_m, math.hypot(told.sigma_m, d / 2.0)
     elif height is None:
         # Flat or round: half-way. The true top lies anywhere in the cap, or where half of the views end.
-        height = standing_height(sides, measured, grid, sigma)
+        standing = standing_height(sides, measured, grid, sigma)
         # Views that lay beside one another do so down-range too: half keep more of a top for that alone.
         share = 0.0 if any(side.shift_m for side in sides) else TIP_SHARE
-        height = height or cap_height(cap, down * math.tan(grazing), share)
+        height = standing or cap_height(cap, down * math.tan(grazing), share)
         sigma = math.hypot(sigma, max(cap.half_m - height, height - cap.begins_m, 0.0) / _SIGMAS_95)
+        above = cap.apex_m - height if standing is None and cap.apex_m > height else 0.0
     if sum(not side.cut for side in sides) >= LEAST_ENDS:
-        intervals["height_m"] = (max(0.0, height - _SIGMAS_95 * sigma), height + _SIGMAS_95 * sigma)
+        half = _SIGMAS_95 * sigma
+        intervals["height_m"] = (max(0.0, height - half), height + math.hypot(half, above))
         # A surface that lies wrong by one error everywhere.
         change = float(mesh.area) * math.hypot(edge / 2.0, d / 4.0)
         intervals["volume_m3"] = (max(0.0, whole.volume_m3 - change), whole.volume_m3 + change)
