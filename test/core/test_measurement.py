@@ -217,11 +217,35 @@ def test_sides_that_opposite_views_see_at_different_places_are_counted(arc_deg, 
     sides = touched(drawn_sides(box_support(0.6, 0.4)), arc_deg)
     z, y, x = np.meshgrid(VOLUME.z_m, VOLUME.y_m, VOLUME.x_m, indexing="ij")
     grid = grid_of((np.abs(x) < 0.3) & (np.abs(y) < 0.2) & (z < 0.2))
-    assert sides_apart(sides, grid) == pytest.approx(share, abs=0.02)
+    assert sides_apart(sides, grid)[0] == pytest.approx(share, abs=0.02)
     # Of half a circle no side is seen twice.
     half = [one for one in sides if one.info.aspect_rad < math.pi - 0.3]
-    assert sides_apart(half, grid) == 0.0
-    assert sides_apart([], grid) == 0.0
+    assert sides_apart(half, grid)[0] == 0.0
+    assert sides_apart([], grid) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("out_cells", [0.0, 1.5, 2.6, 6.0])
+def test_an_echo_far_outside_of_the_plan_is_a_doubt_and_moves_no_side(out_cells):
+    """Near ones move it: a low foot shines. Far ones may be bright seabed."""
+    bare = drawn_sides(box_support(0.6, 0.4))
+    cell = bare[0].info.resolution_m[1]
+    out_m = out_cells * cell
+    seen = out_m + 0.75 * cell if out_cells else math.nan  # what walls spread
+    sides = [replace(one, echo_support_m=tuple(s + seen for s in one.support_m)) for one in bare]
+    z, y, x = np.meshgrid(VOLUME.z_m, VOLUME.y_m, VOLUME.x_m, indexing="ij")
+    grid = grid_of((np.abs(x) < 0.3) & (np.abs(y) < 0.2) & (z < 0.2))
+    mesh = mesh_from_grid(grid)
+    measured, without = (measure_object(grid, mesh, told) for told in (sides, bare))
+    for name, true in (("length_m", 0.6), ("width_m", 0.4)):
+        moved = 2.0 * out_m if out_cells < 3.0 else 0.0
+        assert getattr(measured, name) == pytest.approx(true + moved, abs=0.4 * cell)
+        # Whichever of the two is right, the interval holds it.
+        low, high = measured.intervals[name]
+        assert low <= true
+        assert high >= true + 2.0 * out_m
+        if not out_cells:
+            assert (low, high) == without.intervals[name]
+    assert sides_apart(sides, grid)[1] == (1.0 if out_cells > 2.0 else 0.0)
 
 
 def test_an_extent_whose_sides_lie_apart_is_told_with_less_certainty():

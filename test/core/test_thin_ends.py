@@ -24,6 +24,7 @@ from csas_shadow_ros.core.shape.volume import Volume, VoxelGrid
 from csas_shadow_ros.simulation import iou, shadow_hull, simulate
 from csas_shadow_ros.simulation.bodies import frustum
 from csas_shadow_ros.simulation.profiles import Faults
+from csas_shadow_ros.simulation.targets import join_bodies
 
 COARSE = PipelineParameters(sub_aperture=SubApertureParameters(step_deg=6.0))
 SIZE = 400
@@ -147,3 +148,19 @@ def test_neighbours_in_one_volume_are_told_apart_and_a_body_with_a_gap_is_not():
     ((neighbour,), nothing) = objects_of(rest, (0.0, 0.0), [own], cut=True)
     assert nothing == []
     assert neighbour.volume.centre_m[0] == pytest.approx(1.25, abs=0.05)
+
+
+@pytest.mark.parametrize("foot_m", [0.3, 0.6, 0.7])
+def test_a_low_bright_foot_without_a_shadow_is_told(foot_m):
+    """A drum 0.30 m wide on a foot that rises at 11°, under the sonar's 22°: was 0.23 to 0.40 m, "good"."""
+    foot = frustum(foot_m, 0.3, (foot_m - 0.3) / 10.0 + 1e-6)
+    drum = frustum(0.3, 0.3, 0.2 + (foot_m - 0.3) / 10.0)
+    faults = Faults(contrast_db=12.0)
+    bright = simulate("small", join_bodies([foot, drum]), seed=1, faults=faults, echo_db=17.0)
+    result = run(bright.image, bright.track, COARSE)
+    low, high = result.dimensions.intervals["length_m"]
+    assert low <= 0.3 + 0.02
+    assert high >= 0.95 * foot_m
+    told = [reason for reason in result.quality.reasons if "a low foot" in reason]
+    assert bool(told) == (foot_m > 0.3)
+    assert (result.quality.verdict == "good") == (foot_m == 0.3)

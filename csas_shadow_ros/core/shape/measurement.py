@@ -37,7 +37,7 @@ from .cap import HOLE_CELLS, TIP_SHARE, cap_height, cap_of
 from .contour import Contour, contour_height, contour_of
 from .echo_sides import echo_reach_px
 from .mesh import Dimensions, digits_of, measure
-from .opposed import doubt_cells, opposed_share, opposed_sides
+from .opposed import apart_share, doubt_cells, opposed_sides, reach_cells, sides_beyond
 from .rectangle import Rectangle, SupportSamples, fitted_plan, looks_over, shape_of_plan
 from .seabed import largest_piece, leaves_image
 from .volume import VoxelGrid
@@ -638,6 +638,7 @@ class PlanFit:
         # the same sides, whether it came whole or as a sum of sectors. Edges are ten times less sure.
         told = agreed_support(sides) if support_m is None else support_m
         seen[:, 1] = np.round(told, digits_of(grid.volume.voxel_size_m))
+        self._every = seen
         self.directions: FloatArray = _round_circle(_FINE_DIRECTIONS)
         coarse = _round_circle(_DIRECTIONS)
         own = _voxel_support(grid, coarse)
@@ -718,6 +719,21 @@ class PlanFit:
         self.beyond_m = (self._values - self._design @ solution)[: self.count]
         self.counts = self._robust[: self.count] > 0.0
         return np.asarray(self._basis(self.directions) @ solution)
+
+    def outside_m(self, support: FloatArray, told_m: FloatArray) -> FloatArray:
+        """Return how far sides lie outside of the plan, also those that took no part, m.
+
+        Parameters
+        ----------
+        support : ndarray, shape (720,)
+            The plan, as `solve` returned it.
+        told_m : ndarray
+            Where each side lies, m, in the order of all sides.
+        """
+        phi, aperture = self._every[:, 0], self._every[:, 2]
+        looks = np.mod(looks_over(phi, aperture), TWO_PI)
+        reach = np.interp(looks, self.directions, support, period=TWO_PI).mean(axis=1)
+        return np.asarray(told_m - reach - self.centre[0] * np.cos(phi) - self.centre[1] * np.sin(phi))
 
     def plan(self, smallest: Rectangle) -> Rectangle:
         """Return the rectangle round the plan's own shape where it has one, else the smallest round it.
@@ -881,6 +897,65 @@ def shadow_height(side: SilhouetteSides, dimensions: Dimensions) -> float:
     return float(sonar[2] * (side.tip_m - top) / (ground_range + side.tip_m))
 
 
+@dataclass(frozen=True)
+class _PlanTold:
+    """What shadows and echoes tell of a plan.
+
+    Parameters
+    ----------
+    fit : PlanFit
+        Solved for what both tell.
+    support : ndarray, shape (720,)
+        The plan.
+    spread_m : float
+        How far the sides of shadows scatter about a plan of their own, m.
+    apart, beyond, short : (ndarray, ndarray)
+        Directions, and how far opposite views see sides apart (`opposed_sides`); how far outside of the plan
+        echo or shadow tell them; how far inside of it shadows do (`sides_beyond`), cells.
+    """
+
+    fit: PlanFit
+    support: FloatArray
+    spread_m: float
+    apart: tuple[FloatArray, FloatArray]
+    beyond: tuple[FloatArray, FloatArray]
+    short: tuple[FloatArray, FloatArray]
+
+    def doubts_m(
+        self, plan: Rectangle, cell_m: float, aperture_rad: float
+    ) -> list[tuple[float, float, float]]:
+        """Return by how much length and width are in doubt to both sides, downwards, and upwards, m."""
+        doubts = []
+        for face in (plan.heading_rad, plan.heading_rad + math.pi / 2.0):
+            both = doubt_cells(*self.apart, face, aperture_rad)
+            less, more = (reach_cells(*told, face, aperture_rad) for told in (self.short, self.beyond))
+            doubts.append((both * cell_m, less * cell_m, more * cell_m))
+        return doubts
+
+
+def _plan_told(agreed: list[SilhouetteSides], by_shadows: FloatArray, grid: VoxelGrid) -> _PlanTold | None:
+    """Fit the plan to what shadows and echoes tell (as `agreed_sides` returns it); None of too few sides."""
+    fit = PlanFit(agreed, grid, by_shadows)
+    if fit.count < MIN_EDGES:
+        return None
+    support = fit.solve()
+    # Shadows alone tell whether there is one plan: echoes would hide that they do not agree.
+    spread_m = fit.spread_m
+    apart = opposed_sides(agreed, np.where(fit.kept, by_shadows, np.nan))
+    by_echoes = _with_echoes(by_shadows, agreed)
+    if (by_echoes != by_shadows).any():
+        # An echo far outside of what was carved may be the seabed's: it is a doubt, and moves no side.
+        near = PlanFit(agreed, grid, by_echoes).kept
+        fit = PlanFit(agreed, grid, np.where(near, by_echoes, by_shadows))
+        support = fit.solve()
+    # A slope's echo does not spread: what is moved out may lie as far out as it is seen.
+    cell_m = np.array([side.info.resolution_m[1] for side in agreed for _ in side.direction_rad])
+    farthest = by_echoes + np.where(by_echoes > by_shadows, _ECHO_SPREAD_CELLS * cell_m, 0.0)
+    beyond = sides_beyond(agreed, fit.outside_m(support, farthest))
+    short = sides_beyond(agreed, -fit.outside_m(support, by_shadows))
+    return _PlanTold(fit, support, spread_m, apart, beyond, short)
+
+
 def measure_object(
     grid: VoxelGrid, mesh: trimesh.Trimesh, sides: Sequence[SilhouetteSides], *, seed: int = 0
 ) -> Dimensions:
@@ -913,32 +988,24 @@ def measure_object(
     """
     whole = measure(mesh)
     sides, by_shadows = agreed_sides(sides, grid)
-    fit = PlanFit(sides, grid, by_shadows)
-    if fit.count < MIN_EDGES:
+    told = _plan_told(sides, by_shadows, grid)
+    if told is None:
         return whole
-    support = fit.solve()
-    # Shadows alone tell whether there is one plan: echoes would hide that they do not agree.
-    spread_m = fit.spread_m
-    apart = opposed_sides(sides, np.where(fit.kept, by_shadows, np.nan))
-    by_echoes = _with_echoes(by_shadows, sides)
-    if (by_echoes != by_shadows).any():
-        fit = PlanFit(sides, grid, by_echoes)
-        support = fit.solve()
-    smallest = _rectangle(support, fit.centre)
+    fit = told.fit
+    smallest = _rectangle(told.support, fit.centre)
     plan = fit.plan(smallest)
     grazing = float(np.median([side.info.camera.grazing_rad for side in sides]))
     resampled = _resampled(fit, plan, sides, seed)
     down, across = (float(np.median([s.info.resolution_m[axis] for s in sides])) for axis in (0, 1))
     edge = _EDGE_CELLS * across
     d = grid.volume.voxel_size_m
-    if spread_m > ONE_PLAN_CELLS * across:
+    if told.spread_m > ONE_PLAN_CELLS * across:
         # No one plan has these sides, as where each view lies at a place of its own: the voxels, which a few
         # views do not move, are what all agree on.
         solid = _without_thin_parts(grid, _THIN_CELLS * across)
         plan = _rectangle(_voxel_support(solid, fit.directions), np.zeros(2))
     aperture = float(np.median([side.info.aperture_rad for side in sides]))
-    along, beside = (across * doubt_cells(*apart, plan.heading_rad + t, aperture) for t in (0.0, math.pi / 2))
-    intervals = _plan_intervals(plan, smallest, resampled, edge, (along, beside))
+    intervals = _plan_intervals(plan, smallest, resampled, edge, told.doubts_m(plan, across, aperture))
     cap = cap_of(grid, grazing, HOLE_CELLS * across, down * math.tan(grazing), across)
     sigma, above = math.hypot(d / 2.0, down * math.tan(grazing)), 0.0
     measured = replace(
@@ -950,11 +1017,11 @@ def measure_object(
         hull_top_m=cap.top_m,
     )
     contours = [(side.info, side.contour) for side in sides if side.contour is not None]
-    told = contour_height(contours, measured.position_m, cap.top_m)
-    tops = [cap.begins_m] if told is None else [cap.begins_m, told.height_m]
+    contour = contour_height(contours, measured.position_m, cap.top_m)
+    tops = [cap.begins_m] if contour is None else [cap.begins_m, contour.height_m]
     height = upright_height(sides, measured, tops, sigma, d)
-    if height is None and told is not None:
-        height, sigma = told.height_m, math.hypot(told.sigma_m, d / 2.0)
+    if height is None and contour is not None:
+        height, sigma = contour.height_m, math.hypot(contour.sigma_m, d / 2.0)
     elif height is None:
         # Flat or round: half-way. The true top lies anywhere in the cap, or where half of the views end.
         standing = standing_height(sides, measured, grid, sigma)
@@ -969,12 +1036,30 @@ def measure_object(
         # A surface that lies wrong by one error everywhere.
         change = float(mesh.area) * math.hypot(edge / 2.0, d / 4.0)
         intervals["volume_m3"] = (max(0.0, whole.volume_m3 - change), whole.volume_m3 + change)
-    return replace(measured, height_m=height, intervals=intervals, scatter_cells=spread_m / across)
+    return replace(measured, height_m=height, intervals=intervals, scatter_cells=told.spread_m / across)
 
 
-def sides_apart(sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> float:
-    """Return the share of a body's sides that opposite views see at different places (`opposed_sides`)."""
-    return opposed_share(opposed_sides(*agreed_sides(sides, grid))[1])
+def sides_apart(sides: Sequence[SilhouetteSides], grid: VoxelGrid) -> tuple[float, float]:
+    """Return the shares of a body's sides that are seen at different places.
+
+    Parameters
+    ----------
+    sides : sequence of SilhouetteSides
+        Of all views.
+    grid : VoxelGrid
+        What was carved of them.
+
+    Returns
+    -------
+    opposed : float
+        Share that opposite views see apart (`opposed_sides`).
+    beside : float
+        Share that shadow or echo tell beside the plan (`sides_beyond`).
+    """
+    agreed, by_shadows = agreed_sides(sides, grid)
+    told = _plan_told(agreed, by_shadows, grid)
+    beside = 0.0 if told is None else apart_share(np.fmax(told.beyond[1], told.short[1]))
+    return apart_share(opposed_sides(agreed, by_shadows)[1]), beside
 
 
 def _plan_intervals(
@@ -982,19 +1067,19 @@ def _plan_intervals(
     smallest: Rectangle,
     resampled: Sequence[Rectangle],
     edge_m: float,
-    doubt_m: tuple[float, float],
+    doubts_m: Sequence[tuple[float, float, float]],
 ) -> dict[str, tuple[float, float]]:
     """Return the 95 % intervals of a plan by its resamplings, an edge's error, and what views see apart.
 
     And by how far it is from the smallest rectangle round the best convex plan: which of the two is right is
-    not known.
+    not known. And by what shadow or echo tell beside the plan, to that side alone.
     """
     intervals = {}
-    for name, doubt in zip(("length_m", "width_m"), doubt_m, strict=True):
+    for name, (doubt, less, more) in zip(("length_m", "width_m"), doubts_m, strict=True):
         value = getattr(plan, name)
         sigma = math.hypot(float(np.std([getattr(r, name) for r in resampled])), edge_m)
         half = math.hypot(_SIGMAS_95 * sigma, doubt, value - getattr(smallest, name))
-        intervals[name] = (max(0.0, value - half), value + half)
+        intervals[name] = (max(0.0, value - math.hypot(half, less)), value + math.hypot(half, more))
     for axis, name in enumerate(("position_x_m", "position_y_m")):
         sigma = math.hypot(float(np.std([r.position_m[axis] for r in resampled])), edge_m / 2.0)
         value = plan.position_m[axis]

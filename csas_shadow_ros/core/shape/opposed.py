@@ -1,8 +1,11 @@
-"""Do views from opposite sides bound a plan at the same place?
+"""Do all that tell a plan's sides tell them at the same place?
 
 A direction's side is seen from two aspects, half a circle apart. A body's own side lies at one place. Where
 the two disagree, another shadow touches the body's in one of them, or a part of it casts none there. Nothing
 tells which.
+
+And shadow and echo tell it. A foot that slopes gently shines and casts no shadow, and so does bright seabed
+round a body. Nothing tells these two apart either.
 """
 
 from __future__ import annotations
@@ -66,6 +69,60 @@ def opposed_sides(sides: Sequence[SilhouetteSides], support_m: FloatArray) -> tu
     return directions, apart
 
 
+def sides_beyond(
+    sides: Sequence[SilhouetteSides], beyond_m: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return how far most views see the sides outside of a plan.
+
+    Parameters
+    ----------
+    sides : sequence of SilhouetteSides
+        Of all views.
+    beyond_m : ndarray of float
+        How far each of their sides lies outside of it, m; NaN for one that tells nothing.
+
+    Returns
+    -------
+    direction_rad : ndarray of float, shape (120,)
+        Directions of sides.
+    beyond_cells : ndarray of float, shape (120,)
+        The median of what is seen there, cross-range cells; NaN where too few views see it.
+    """
+    directions: FloatArray = np.arange(_DIRECTIONS, dtype=np.float64) * (TWO_PI / _DIRECTIONS)
+    beyond: FloatArray = np.full(_DIRECTIONS, math.nan)
+    if not sides:
+        return directions, beyond
+    phi = np.array([angle for side in sides for angle in side.direction_rad])
+    within = _WITHIN * np.array([side.info.aperture_rad for side in sides for _ in side.direction_rad])
+    cell_m = float(np.median([side.info.resolution_m[1] for side in sides]))
+    for n, direction in enumerate(directions):
+        near = (np.abs(wrap_angle(phi - direction)) <= within + 1e-9) & np.isfinite(beyond_m)
+        if np.count_nonzero(near) >= _LEAST:
+            beyond[n] = float(np.median(beyond_m[near])) / cell_m
+    return directions, beyond
+
+
+def reach_cells(directions: FloatArray, beyond: FloatArray, face_rad: float, aperture_rad: float) -> float:
+    """Return by how much an extent grows if its two sides lie where `sides_beyond` says, cross-range cells.
+
+    Parameters
+    ----------
+    directions, beyond : ndarray of float
+        As `sides_beyond` returns them.
+    face_rad : float
+        Direction that one of the sides faces; the other faces away from it.
+    aperture_rad : float
+        What lies within half of it tells a side.
+    """
+    total = 0.0
+    for face in (face_rad, face_rad + math.pi):
+        near = beyond[(np.abs(wrap_angle(directions - face)) <= aperture_rad / 2.0 + 1e-9)]
+        near = near[np.isfinite(near)]
+        median = float(np.median(near)) if len(near) else 0.0
+        total += median if median > _EDGE_CELLS else 0.0
+    return total
+
+
 def doubt_cells(directions: FloatArray, apart: FloatArray, face_rad: float, aperture_rad: float) -> float:
     """Return how far an extent may be off as its two sides lie apart, cross-range cells.
 
@@ -83,7 +140,7 @@ def doubt_cells(directions: FloatArray, apart: FloatArray, face_rad: float, aper
     return max(0.0, float(near.max()) - _EDGE_CELLS) if len(near) else 0.0
 
 
-def opposed_share(apart: FloatArray) -> float:
-    """Return the share of the sides that opposite views see at different places; 0 where none is seen."""
+def apart_share(apart: FloatArray) -> float:
+    """Return the share of the sides that lie apart by more than `APART_CELLS`; 0 where none is seen."""
     known = apart[np.isfinite(apart)]
     return float((known > APART_CELLS).mean()) if len(known) else 0.0

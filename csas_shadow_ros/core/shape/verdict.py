@@ -247,11 +247,17 @@ def _fit_of(result: Result, reasons: list[str]) -> int:
         )
         worst = max(worst, 1)
     grid = result.grid if result.dimensions is not None else None
-    apart = sides_apart(result.sides, grid) if grid is not None and result.sides else 0.0
+    apart, beside = sides_apart(result.sides, grid) if grid is not None and result.sides else (0.0, 0.0)
     if apart > _MOST_APART:
         reasons.append(
             f"opposite views see {100.0 * apart:.0f} % of the sides at different places: another shadow"
             " touches its own, or a part of it casts none from one side"
+        )
+        worst = max(worst, 1)
+    if beside > _MOST_APART:
+        reasons.append(
+            f"shadow or echo tell {100.0 * beside:.0f} % of the sides beside its plan: a low foot that casts"
+            " no shadow, bright seabed round it, or another shadow that touches its own"
         )
         worst = max(worst, 1)
     return worst
