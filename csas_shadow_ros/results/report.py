@@ -479,10 +479,10 @@ def spread_text(value: float, ends: Sequence[float], digits: int) -> str:
     Examples
     --------
     >>> spread_text(0.5, (0.4, 0.6), 2), spread_text(0.5, (0.45, 0.7), 2)
-    ('± 0.10', '-0.05 +0.20')
+    ('± 0.10', '−0.05 +0.20')
     """
     down, up = (f"{abs(end - value):.{digits}f}" for end in ends)
-    return f"± {up}" if down == up else f"-{down} +{up}"
+    return f"± {up}" if down == up else f"−{down} +{up}"
 
 
 def _size_lines(mine: Mapping[str, Any], true: Mapping[str, Any]) -> list[str]:

@@ -26,7 +26,7 @@ ASPECTS_DEG = (20.0, 160.0, 200.0, 340.0)
 VISIBLE_DB = 6.0
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run():
     return simulate("standard", "frame", seed=1)
 

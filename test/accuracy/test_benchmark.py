@@ -26,17 +26,17 @@ VOXEL_M = 0.02
 of_first_run = pytest.mark.xdist_group("first run")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def settings(accuracy):
     return accuracy.Settings("tiny", 15.0, (accuracy.WITH_FFSE,))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def cases(accuracy):
     return accuracy.plan(("box", accuracy.EMPTY), (2,), ("clean", "contrast"), empty_seabeds=1)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def first_run(accuracy, settings, cases, tmp_path_factory):
     record = tmp_path_factory.mktemp("accuracy") / "first.jsonl"
     said: list[str] = []

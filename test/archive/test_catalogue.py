@@ -32,7 +32,7 @@ BREST = Datum(48.36, -4.55)
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def results(tiny_box_bag, tmp_path_factory):
     """A results folder by `process_bag`, in a folder of its own."""
     out = tmp_path_factory.mktemp("plain") / "box"

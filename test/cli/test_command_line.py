@@ -50,7 +50,7 @@ class Said:
         return json.loads(self.out)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def results(tiny_box_bag, tmp_path_factory):
     """The complete results folder of the box, by the command line."""
     out = tmp_path_factory.mktemp("results") / "box"

@@ -27,7 +27,7 @@ CI = ROOT / "examples" / "ci"
 QUICK = ["--step-deg", "20", "--voxel-size-m", "0.08", "--no-bag", "--no-figures", "--quiet"]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def report(tiny_box_bag: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     out = tmp_path_factory.mktemp("expected") / "out"
     assert main(["run", str(tiny_box_bag.path), "--out", str(out), *QUICK]) == 0

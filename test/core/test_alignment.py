@@ -124,7 +124,7 @@ P = PipelineParameters(
 )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def views(box_run):
     """A run's shadow views, and what comes of them."""
     made = []
@@ -132,7 +132,7 @@ def views(box_run):
     return made, result
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def misplaced(views):
     """The same views, each beside its place by 1.5 cells (1σ), and how far, m."""
     made, _ = views

@@ -219,7 +219,7 @@ def test_nothing_is_said_of_a_fit_that_nobody_looked_at():
     assert explained_share(result) is None
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def mattress(tmp_path_factory):
     """A simulated box that is five times as long as high, and what the chain makes of it."""
     mesh = trimesh.creation.box((1.0, 0.6, 0.2))

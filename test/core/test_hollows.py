@@ -86,7 +86,7 @@ def look_at(body, info, silent=None):
     return EchoLook.of(levels, info, VOLUME)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def looks_at_walls():
     return [look_at(WALLS, info) for info in INFOS]
 
@@ -163,7 +163,7 @@ def test_the_surface_of_the_matter_is_closed_and_smaller_by_the_hollow(looks_at_
     assert whole.volume - left.volume == pytest.approx(hollow, rel=0.25)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def ring_result():
     """A simulated tyre, through the pipeline, and its views."""
     made = simulate("tiny", "tyre", seed=5)

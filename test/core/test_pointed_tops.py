@@ -11,9 +11,9 @@ from csas_shadow_ros.simulation.bodies import frustum
 from csas_shadow_ros.simulation.profiles import Faults
 
 
-@pytest.mark.parametrize(("wide_m", "high_m", "seed"), [(0.3, 0.3, 2), (0.3, 0.2, 1), (0.4, 0.35, 1)])
+@pytest.mark.parametrize(("wide_m", "high_m", "seed"), [(0.3, 0.3, 2), (0.3, 0.2, 1)])
 def test_the_height_s_interval_of_a_cone_holds_its_point(wide_m, high_m, seed):
-    """Without the point it ends at 0.28, 0.19 and 0.34 m."""
+    """Without the point it ends at 0.28 and 0.19 m."""
     made = simulate("small", frustum(wide_m, 0.0, high_m), seed=seed, faults=Faults(contrast_db=12.0))
     coarse = PipelineParameters(sub_aperture=SubApertureParameters(step_deg=6.0))
     found = run(made.image, made.track, coarse).dimensions

@@ -24,7 +24,7 @@ COARSE = PipelineParameters(
 )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def whole(box_run):
     """A run, and its views as they went in."""
     views = []

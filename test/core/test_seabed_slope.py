@@ -118,7 +118,7 @@ def test_a_shadow_has_an_end_only_where_seabed_is_seen_behind_it():
 TILT = math.tan(math.radians(2.0))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def level_and_tilted(box_run):
     """Reconstruct a box over a level seabed, and with a track whose heights refer to a level 2° off."""
     positions = box_run.track.positions_m.copy()

@@ -36,7 +36,7 @@ COARSE = PipelineParameters(
 BOX_M, CYLINDER_M = (0.8, 0.4, 0.4), (0.8, 0.3, 0.3)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def two():
     """A box and a piece of a cylinder, 2.2 m apart."""
     bodies = box(*BOX_M), cylinder(CYLINDER_M[0], CYLINDER_M[1])
@@ -48,12 +48,12 @@ def two():
     return run, sorted((tuple(m) for m in middles), key=lambda m: m[0])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def two_objects(two):
     return pipeline.run(two[0].image, two[0].track, COARSE)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def in_laying_grid():
     run = simulate("standard", "frame_grid", seed=1)
     return run, pipeline.run(run.image, run.track, COARSE)

@@ -31,12 +31,12 @@ AUTO = PipelineParameters(
 GIVEN = replace(AUTO, target=TargetParameters(target="given", position_m=(0.2, -0.1), size_m=(1.5, 1.5, 0.7)))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def simulated():
     return simulate("tiny", "box", seed=1, position_m=(0.2, -0.1), start_aspect_deg=17.0)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def sectors(simulated):
     return [sector for sector, _ in sectors_of_run(simulated.image, simulated.track, 15.0)]
 

@@ -65,7 +65,7 @@ def turned(hidden_low, hidden_high, position, heading):
 BOX_SHADOW = turned((-0.25, -0.15, 0.0), (0.25, 0.15, 0.25), (0.1, -0.15), math.radians(25.0))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def box_result(box_run):
     p = replace(FAST, sub_aperture=SubApertureParameters(step_deg=10.0), target=TargetParameters())
     calls, seen = [], []

@@ -44,7 +44,7 @@ def apart(one, other=TRUTH) -> float:
     return math.hypot(one[0] - other[0], one[1] - other[1])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def results(tmp_path_factory) -> Path:
     """Results of a box of 0.8 m × 0.4 m with a datum."""
     folder = tmp_path_factory.mktemp("maps")
@@ -62,7 +62,7 @@ def results(tmp_path_factory) -> Path:
     return folder / "results"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def read_back(results, tmp_path_factory) -> dict[str, dict]:
     out = tmp_path_factory.mktemp("out") / "maps"
     done = export_result(results, out)

@@ -54,7 +54,7 @@ def box_bag(tiny_box_bag, tmp_path):
     return bag
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def right_grid(tiny_box_bag, tmp_path_factory):
     """The grid of the box's bag with its sound truth."""
     out = tmp_path_factory.mktemp("right") / "out"

@@ -153,7 +153,8 @@ def contacts_are_listed_and_gone_to(d: Desktop) -> None:
         assert d.js("csas.solid.controls.target.toArray().slice(0, 2)") == pytest.approx(place)
         found, true = lengths[contact]
         row = d.page.locator("#dimensions tr", has_text="Length").inner_text()
-        assert re.search(rf"{found:.2f} ± [\d.]+ m\s+{true:.2f} m", row), "the truth is this contact's own"
+        spread = r"(± [\d.]+|−[\d.]+ \+[\d.]+)"
+        assert re.search(rf"{found:.2f} {spread} m\s+{true:.2f} m", row), "the truth is this contact's own"
         sheet = sheet_of(d.store, contact)
         assert sheet.rows[0] == ["Length", row.split("\t")[1], f"{true:.2f} m"], "the report too"
         # The report's picture has its whole shadow: no edge of the scene, and no neighbour, cuts it off.

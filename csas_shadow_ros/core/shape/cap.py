@@ -13,6 +13,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
+from ..equality import equal_where_nan
 from ..methods import method_named
 from .volume import VoxelGrid
 
@@ -60,6 +61,7 @@ _BLUNT_CELLS = 0.6
 _INSIDE_CELLS = 0.25
 
 
+@equal_where_nan
 @dataclass(frozen=True)
 class Cap:
     """The top of a carved shape, which shadows show only in part.

@@ -52,27 +52,37 @@ def opposed_sides(sides: Sequence[SilhouetteSides], support_m: FloatArray) -> tu
     apart_cells : ndarray of float, shape (120,)
         Difference of the medians from either aspect, cross-range cells; NaN where one of them sees nothing.
     """
+    directions, (right, left) = _by_aspect(sides, support_m)
+    return directions, np.abs(right - left)
+
+
+def _by_aspect(
+    sides: Sequence[SilhouetteSides], told_m: FloatArray
+) -> tuple[FloatArray, tuple[FloatArray, FloatArray]]:
+    """Return directions, and in each the median of what sides tell from either aspect, cells; NaN of few."""
     directions: FloatArray = np.arange(_DIRECTIONS, dtype=np.float64) * (TWO_PI / _DIRECTIONS)
-    apart: FloatArray = np.full(_DIRECTIONS, math.nan)
+    medians: tuple[FloatArray, FloatArray] = (
+        np.full(_DIRECTIONS, math.nan),
+        np.full(_DIRECTIONS, math.nan),
+    )
     if not sides:
-        return directions, apart
+        return directions, medians
     phi = np.array([angle for side in sides for angle in side.direction_rad])
     right = np.array([sign > 0 for side in sides for sign in side.signs])
     within = _WITHIN * np.array([side.info.aperture_rad for side in sides for _ in side.direction_rad])
     cell_m = float(np.median([side.info.resolution_m[1] for side in sides]))
     for n, direction in enumerate(directions):
-        near = np.abs(wrap_angle(phi - direction)) <= within + 1e-9
-        near &= np.isfinite(support_m)
-        seen = [support_m[near & (right == from_right)] for from_right in (True, False)]
-        if min(map(len, seen)) >= _LEAST:
-            apart[n] = abs(float(np.median(seen[0]) - np.median(seen[1]))) / cell_m
-    return directions, apart
+        near = (np.abs(wrap_angle(phi - direction)) <= within + 1e-9) & np.isfinite(told_m)
+        for median, aspect in zip(medians, (near & right, near & ~right), strict=True):
+            if np.count_nonzero(aspect) >= _LEAST:
+                median[n] = float(np.median(told_m[aspect])) / cell_m
+    return directions, medians
 
 
 def sides_beyond(
     sides: Sequence[SilhouetteSides], beyond_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how far most views see the sides outside of a plan.
+    """Return how far most views see the sides outside of a plan, from either aspect.
 
     Parameters
     ----------
@@ -86,20 +96,11 @@ def sides_beyond(
     direction_rad : ndarray of float, shape (120,)
         Directions of sides.
     beyond_cells : ndarray of float, shape (120,)
-        The median of what is seen there, cross-range cells; NaN where too few views see it.
+        The median of what is seen there, cross-range cells; of both aspects the lesser: where they differ,
+        `opposed_sides` says so. NaN where too few views see it.
     """
-    directions: FloatArray = np.arange(_DIRECTIONS, dtype=np.float64) * (TWO_PI / _DIRECTIONS)
-    beyond: FloatArray = np.full(_DIRECTIONS, math.nan)
-    if not sides:
-        return directions, beyond
-    phi = np.array([angle for side in sides for angle in side.direction_rad])
-    within = _WITHIN * np.array([side.info.aperture_rad for side in sides for _ in side.direction_rad])
-    cell_m = float(np.median([side.info.resolution_m[1] for side in sides]))
-    for n, direction in enumerate(directions):
-        near = (np.abs(wrap_angle(phi - direction)) <= within + 1e-9) & np.isfinite(beyond_m)
-        if np.count_nonzero(near) >= _LEAST:
-            beyond[n] = float(np.median(beyond_m[near])) / cell_m
-    return directions, beyond
+    directions, medians = _by_aspect(sides, beyond_m)
+    return directions, np.fmin(*medians)
 
 
 def reach_cells(directions: FloatArray, beyond: FloatArray, face_rad: float, aperture_rad: float) -> float:
